@@ -1,0 +1,58 @@
+"""Agent learner actor: one member at a time learns in imagination."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+
+import numpy as np
+
+from actors.common import build_env, settle
+from popgen.algos.xpm_wm.agent_learner import AgentLearner
+from popgen.algos.xpm_wm.starts import Starts
+from popgen.config import RunConfig
+from popgen.nets.weights import Weights, prefixed, under, weights_of
+
+
+class AgentActor:
+    """Thin: every number is made by `AgentLearner`."""
+
+    def __init__(self, config: RunConfig, threads: int) -> None:
+        settle(threads)
+        self.config = config
+        self.spec = build_env(config.env, 1).spec
+        self.model: Weights = {}
+
+    def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
+        """A fresh actor and critics beside frozen predecessors (actor weights by member)."""
+        self.learner = AgentLearner(self.config.agent, self.config.world_model, self.spec, member, seed)
+        for partner, weights in partners.items():
+            self.learner.add_partner(partner, weights)
+
+    def restart(self, seed: int) -> None:
+        """Fresh actor and critics on the same world model."""
+        self.learner.restart(seed)
+
+    def train(
+        self, updates: int, model: Weights, starts: Starts, new_share: float, partner_scores: dict[int, float]
+    ) -> tuple[Weights, dict[str, float]]:
+        """Imagine and update `updates` times; acting weights (filter and actor) and mean metrics."""
+        began = time.perf_counter()
+        self.learner.set_model(model)
+        self.learner.set_starts(starts, new_share)
+        self.learner.partner_scores = dict(partner_scores)
+        totals: dict[str, list[float]] = defaultdict(list)
+        for _ in range(updates):
+            for name, value in self.learner.update().items():
+                totals[name].append(value)
+        means = {name: float(np.mean(values)) for name, values in totals.items()}
+        means["seconds"] = time.perf_counter() - began
+        return self.acting_weights(model), means
+
+    def acting_weights(self, model: Weights) -> Weights:
+        """Policy weights: the filter of `model` and this member's actor."""
+        return prefixed("filter", under("filter", model)) | prefixed("actor", self.learner.actor_weights())
+
+    def critics(self) -> Weights:
+        """Critic weights by partner, for the member's training file."""
+        return weights_of(self.learner.critics)

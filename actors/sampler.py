@@ -1,0 +1,63 @@
+"""Sampler actor: steps real environments with published policies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from actors.common import build_env, settle
+from popgen.config import EnvConfig
+from popgen.data.sampler import Episode, Sampler, Team
+from popgen.nets.weights import Weights
+from popgen.policies.registry import build_policy
+from popgen.types import Kind, Segment
+
+
+@dataclass(frozen=True)
+class PolicyParts:
+    """A policy as it travels: kind, configuration and weights (`popgen.policies.registry.build_policy`)."""
+
+    kind: str
+    config: dict[str, Any]
+    weights: Weights
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What the ledger and the driver need of a round of sampling, beside the segments themselves.
+
+    counts: (kind, members, sequence, steps) per segment; episodes: those that ended.
+    """
+
+    sampler: str
+    counts: list[tuple[Kind, tuple[int, int], int, int]]
+    episodes: list[Episode]
+
+
+class SamplerActor:
+    """Holds one `Sampler` at a time; segment numbers go on over all of them."""
+
+    def __init__(self, env: EnvConfig, name: str, threads: int) -> None:
+        settle(threads)
+        self.env_config, self.name = env, name
+        self.sequence = 0
+        self.sampler: Sampler | None = None
+
+    def open(self, teams: list[Team], parts: dict[int, PolicyParts], seed: int, stagger: bool) -> None:
+        """Start fresh episodes of the given teams; `parts` holds a policy for every member in them."""
+        env = build_env(self.env_config, sum(team.envs for team in teams), seed)
+        policies = {member: build_policy(p.kind, p.config, p.weights, env.spec) for member, p in parts.items()}
+        self.sampler = Sampler(
+            env, teams, policies, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence
+        )
+
+    def collect(self, steps: int, load: dict[int, Weights] | None = None) -> tuple[list[Segment], Collected]:
+        """Play `steps` joint steps, with new weights for the given members; segments and their counts."""
+        if self.sampler is None:
+            raise RuntimeError("open before collect")
+        for member, weights in (load or {}).items():
+            self.sampler.policies[member].load(weights)
+        segments, episodes = self.sampler.collect(steps)
+        self.sequence = self.sampler.sequence
+        counts = [(s.kind, s.members, s.sequence, s.steps) for s in segments]
+        return segments, Collected(self.name, counts, episodes)

@@ -1,0 +1,71 @@
+"""The actors of a run and the calls the driver makes to them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+
+from actors.agent_learner import AgentActor
+from actors.common import options
+from actors.model_learner import ModelActor
+from actors.replay import ReplayActor
+from actors.sampler import SamplerActor
+from popgen.config import ClusterConfig, RunConfig
+
+
+def start_ray(cluster: ClusterConfig) -> bool:
+    """Connect to a cluster or start a local one; True if this call did it."""
+    if ray.is_initialized():
+        return False
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Quiet: Ray warns once about the accelerator variable it will stop overriding.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    local = cluster.address is None
+    ray.init(
+        address=cluster.address,
+        num_cpus=cluster.num_cpus if local else None,
+        include_dashboard=False if local else None,
+        log_to_driver=False,
+        logging_level="ERROR",
+    )
+    return True
+
+
+@dataclass
+class Crew:
+    """Handles of one run's actors."""
+
+    samplers: list[Any]
+    replay_sp: Any
+    replay_xp: Any
+    model: Any
+    agent: Any
+
+    @staticmethod
+    def hire(config: RunConfig, attempt: int) -> Crew:
+        """Create all actors; sampler names carry the attempt, so that a resumed run's ledger keys are new."""
+        cluster, seed = config.cluster, config.run.seed
+        sampler = ray.remote(SamplerActor).options(**options(cluster, cluster.sampler_cpus))
+        replay = ray.remote(ReplayActor).options(**options(cluster, cluster.replay_cpus))
+        model = ray.remote(ModelActor).options(**options(cluster, cluster.model_cpus, cluster.model_gpus))
+        agent = ray.remote(AgentActor).options(**options(cluster, cluster.agent_cpus, cluster.agent_gpus))
+        crew = Crew(
+            samplers=[
+                sampler.remote(config.env, f"sampler{index}.{attempt}", cluster.threads)
+                for index in range(cluster.samplers)
+            ],
+            replay_sp=replay.remote(config.env, config.replay.capacity, seed * 1000 + 11),
+            replay_xp=replay.remote(config.env, config.replay.capacity, seed * 1000 + 12),
+            model=model.remote(config, seed * 1000 + 21, cluster.threads),
+            agent=agent.remote(config, cluster.threads),
+        )
+        ray.get(crew.model.connect.remote(crew.replay_sp, crew.replay_xp))
+        return crew
+
+    def dismiss(self) -> None:
+        """End all actors."""
+        for actor in (*self.samplers, self.replay_sp, self.replay_xp, self.model, self.agent):
+            ray.kill(actor)

@@ -1,0 +1,18 @@
+"""popgen: populations of diverse cooperative partner agents."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__version__ = "0.1.0"
+
+_LAZY = {"load_population": "popgen.population", "make_env": "popgen.envs"}
+__all__ = ["__version__", *_LAZY]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        from importlib import import_module
+
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'popgen' has no attribute {name!r}")

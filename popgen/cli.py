@@ -1,0 +1,462 @@
+"""`popgen COMMAND ...`: the only file that knows Hydra.
+
+Whatever a user can get wrong becomes one line on stderr and exit code 2, before Ray starts; torch, Ray and MLflow are
+imported only by the commands that need them. Results go to stdout, progress to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import errno
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import popgen
+from popgen.errors import UserError
+
+OK, ERROR, INTERRUPTED = 0, 2, 130
+ALIASES = {"seed": "run.seed"}
+OPEN_SECTIONS = ("env.params.", "cluster.resources.")  # dictionaries that take any key
+_DISK = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EROFS: "the file system is read-only",
+    errno.EACCES: "permission denied",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, 2 for an error told in one line, 130 when interrupted."""
+    try:
+        args = _parse(sys.argv[1:] if argv is None else list(argv))
+        return args.command(args)
+    except SystemExit as stop:  # --help and --version
+        return int(stop.code or 0)
+    except UserError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        print("popgen: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output went away
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        where = str(error.filename or "disk")
+        return _fail(
+            str(UserError(where, _DISK[error.errno], "make room or choose another folder; finished parts are kept"))
+        )
+
+
+def _fail(message: str) -> int:
+    print(f"popgen: error: {' '.join(message.split())}", file=sys.stderr)
+    return ERROR
+
+
+# --- commands
+
+
+def _run(args: argparse.Namespace) -> int:
+    from popgen.config import RunConfig
+    from popgen.preflight import preflight
+    from popgen.progress import make_reporter
+
+    config = RunConfig.parse(compose(args.overrides))
+    preflight(config)
+    if args.dry_run:
+        return _print_config(config.model_dump(mode="json"), args.json)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    from pipelines.population import run_population
+
+    reporter = make_reporter(quiet=args.quiet)
+    try:
+        result = run_population(config, reporter=reporter)
+    finally:
+        reporter.close()
+    if args.json:
+        _print_json(result)
+    else:
+        _print_run(result)
+    return OK
+
+
+def _print_config(values: dict[str, Any], as_json: bool) -> int:
+    if as_json:
+        _print_json(values)
+    else:
+        from omegaconf import OmegaConf
+
+        print(OmegaConf.to_yaml(OmegaConf.create(values)), end="")
+    return OK
+
+
+def _print_json(value: Mapping[str, Any]) -> None:
+    """Exactly one JSON object; numbers that are not finite become null."""
+    print(json.dumps(_plain(value), allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # numpy
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def _print_run(result: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    means = result["matrix"]["mean"]
+    table = Table("seat 0 \\ seat 1", *(str(member + 1) for member in range(len(means))), title="SP/XP")
+    for member, row in enumerate(means, start=1):
+        table.add_row(str(member), *("-" if cell is None else f"{cell:.2f}" for cell in row))
+    _print_table(table)
+    counted = ", ".join(
+        f"{'all' if member == 'total' else f'member {member}'} {row['total']:,}"
+        for member, row in result["ledger"].items()
+    )
+    print(f"environment steps: {counted}")
+    print(f"population: {result['population']}   ledger, checkpoints and reports: {result['run_dir']}")
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from popgen.population import check_compatible, load_population
+    from popgen.preflight import check_root
+    from popgen.progress import make_reporter
+
+    population = load_population(args.population)
+    if args.env or args.param:
+        from popgen.envs import make_env
+
+        info = population.env_info
+        name = args.env or info.name
+        params = {**(info.params if name == info.name else {}), **dict(args.param)}
+        check_compatible(population, make_env(name, 1, **params).spec)
+    out = Path(args.out) if args.out else Path(args.population) / "evaluation"
+    check_root(out, 16 * 2**20, "--out")
+    from popgen.evaluation.crossplay import evaluate_population
+    from popgen.evaluation.report import summary, to_dict, to_rich, write_report
+
+    reporter = make_reporter(quiet=args.quiet)
+    try:
+        reporter.phase("evaluation", 1)
+        result = evaluate_population(
+            population,
+            args.episodes,
+            args.seed,
+            args.members,
+            progress=lambda done, total: reporter.update(done / total, episodes=done),
+        )
+    finally:
+        reporter.close()
+    files = write_report(result, out)
+    if args.json:
+        _print_json({**to_dict(result), "files": {suffix: str(path) for suffix, path in files.items()}})
+        return OK
+    _print_table(to_rich(result))
+    print("\n".join([*summary(result), f"report: {out} ({', '.join(path.name for path in files.values())})"]))
+    return OK
+
+
+def _show(args: argparse.Namespace) -> int:
+    from popgen.population import load_population
+
+    population = load_population(args.population)
+    if args.json:
+        _print_json(
+            {
+                "path": str(population.path),
+                "manifest": population.manifest.model_dump(mode="json"),
+                "members": [
+                    info.model_dump(mode="json") | {"total_steps": info.total_steps} for info in population.members
+                ],
+            }
+        )
+        return OK
+    from rich.table import Table
+
+    info = population.env_info
+    print(f"{len(population)} members, {population.manifest.method}, {info.name} {info.params}")
+    kinds = sorted({kind for member in population.members for kind in member.steps})
+    table = Table("member", "policy", "seed", *(f"{kind} steps" for kind in kinds), "all steps")
+    for member in population.members:
+        counts = [f"{member.steps.get(kind, 0):,}" for kind in kinds]
+        table.add_row(str(member.id), member.kind, str(member.seed), *counts, f"{member.total_steps:,}")
+    _print_table(table)
+    print(f"population: {population.path}")
+    return OK
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from pipelines.bench import bench_env
+
+    result = bench_env(args.env, num_envs=args.envs, seconds=args.seconds)
+    if args.json:
+        _print_json(result)
+    else:
+        ratio = "" if result["ratio"] is None else f"   {result['ratio']:,.0f} times the reference"
+        print(f"{args.env}: {result['steps_per_second']:,.0f} environment steps a second{ratio}")
+    return OK
+
+
+def _print_table(table: Any) -> None:
+    from rich.console import Console
+
+    # Piped output has no width of its own; tables of many members must not be cut.
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+# --- configuration
+
+
+def compose(overrides: Sequence[str]) -> dict[str, Any]:
+    """The plain dictionary that conf/ and the overrides give, not yet checked by the schemas.
+
+    Raises:
+        UserError: an override that cannot be read, an unknown group option, key or interpolation.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.config_store import ConfigStore
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from conf import DIRECTORY
+    from popgen.config import RunConfig
+
+    ConfigStore.instance().store(name="schema", node=RunConfig().model_dump(mode="json"))
+    GlobalHydra.instance().clear()
+    given = [_translate(override) for override in overrides]
+    try:
+        with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
+            composed = hydra_compose("config", given)
+        missing = sorted(OmegaConf.missing_keys(composed))
+        values = OmegaConf.to_container(composed, resolve=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise _composition_error(error, overrides) from None
+    for key in missing or _unset(values):
+        raise UserError(key, "has no value", f"give one with {key}=VALUE")
+    assert isinstance(values, dict)
+    values.pop("per_env", None)  # the table that conf/scale/paper.yaml looks values up in
+    return values
+
+
+def group_options(group: str) -> list[str]:
+    """Names that `group=NAME` takes."""
+    from conf import DIRECTORY
+
+    folder = DIRECTORY / group
+    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
+
+
+def _translate(override: str) -> str:
+    """Aliases, and `++` for dictionaries that take any key, so that users need not know Hydra's signs."""
+    key, equals, value = override.partition("=")
+    if not equals:
+        if override.startswith("~"):
+            return override
+        raise UserError("overrides", f"cannot read {override!r}", "write KEY=VALUE")
+    if key.lstrip("+").startswith("hydra"):
+        raise UserError(key, "Hydra's own settings have no use here", "leave it out")
+    if key in ALIASES:
+        return f"{ALIASES[key]}={value}"
+    return f"++{override}" if key.startswith(OPEN_SECTIONS) else override
+
+
+def _unset(values: Any, prefix: str = "") -> list[str]:
+    """Keys whose interpolation gave the mark of a missing value."""
+    if values == "???":
+        return [prefix]
+    items = values.items() if isinstance(values, dict) else ()
+    return [key for name, item in items for key in _unset(item, f"{prefix}.{name}" if prefix else str(name))]
+
+
+def _composition_error(error: Exception, overrides: Sequence[str]) -> UserError:
+    from hydra.errors import MissingConfigException, OverrideParseException
+    from omegaconf.errors import InterpolationKeyError
+
+    from popgen.config import unknown_field
+
+    text = str(error)
+    if isinstance(error, MissingConfigException) and "Could not find" in text:
+        group, _, option = text.partition("Could not find '")[2].partition("'")[0].partition("/")
+        return _unknown_option(group, option)
+    if isinstance(error, OverrideParseException):
+        return UserError(
+            "overrides", f"cannot read {_culprit(text, overrides)!r}", "write KEY=VALUE, with quotes around odd text"
+        )
+    if text.startswith("Ambiguous value"):
+        fix = "write a list as KEY=[a,b]; several runs need several commands"
+        return UserError(
+            "overrides", f"{text.partition(chr(10))[0].rpartition(' ')[2].strip(chr(39))!r} has several values", fix
+        )
+    if text.startswith("Could not override '"):
+        return unknown_field(text.split("'")[1])
+    first = text.partition("\n")[0]
+    if isinstance(error, InterpolationKeyError):
+        return UserError(error.full_key or "overrides", first, "refer to a field that is there")
+    return UserError("overrides", first, "see conf/ for what can be set")
+
+
+def _unknown_option(group: str, option: str) -> UserError:
+    options = group_options(group)
+    by_leaf = {name.rpartition("/")[2]: name for name in options}
+    close = difflib.get_close_matches(option, options, n=1) or [
+        by_leaf[leaf] for leaf in difflib.get_close_matches(option.rpartition("/")[2], by_leaf, n=1)
+    ]
+    listed = f"choose one of {', '.join(options)}" if options else "see conf/"
+    return UserError(group, f"there is no option {option!r}", f"did you mean {group}={close[0]}?" if close else listed)
+
+
+def _culprit(text: str, overrides: Sequence[str]) -> str:
+    return next((override for override in overrides if override in text), overrides[0] if len(overrides) == 1 else text)
+
+
+# --- arguments
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError("arguments", message, f"see {self.prog} --help")
+
+
+def _parse(argv: list[str]) -> argparse.Namespace:
+    parser = _parser()
+    args, rest = parser.parse_known_args(argv)
+    if hasattr(args, "overrides"):  # overrides may stand after options too
+        args.overrides = [*args.overrides, *(word for word in rest if not word.startswith("-"))]
+        rest = [word for word in rest if word.startswith("-")]
+    if rest:
+        raise UserError("arguments", f"unknown argument {rest[0]}", "see popgen --help")
+    if args.command is None:
+        parser.print_help(sys.stderr)
+        raise SystemExit(ERROR)
+    return args
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="popgen", description="Populations of diverse cooperative partner agents.")
+    parser.add_argument("--version", action="version", version=f"popgen {popgen.__version__}")
+    parser.set_defaults(command=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=_Parser)
+    _add_run(commands)
+    _add_population_commands(commands)
+    bench = commands.add_parser("bench", help="measure speed", description="Measure speed.")
+    kinds = bench.add_subparsers(title="what to measure", metavar="WHAT", required=True, parser_class=_Parser)
+    env = _command(
+        kinds,
+        "env",
+        _bench,
+        "step plus all observations on one core, and the reference implementation in the same run",
+        "Keys of --json: steps_per_second, reference_steps_per_second and ratio (null without a reference), "
+        "step_only_per_second, env, num_envs, seconds.",
+    )
+    env.add_argument("--env", default="overcooked/cramped_room", help="registry name (%(default)s)")
+    env.add_argument("--envs", type=_at_least(1), default=1024, help="environments stepped together (%(default)s)")
+    env.add_argument("--seconds", type=_positive, default=2.0, help="time per measurement (%(default)s)")
+    return parser
+
+
+def _add_run(commands: Any) -> None:
+    run = _command(
+        commands,
+        "run",
+        _run,
+        "generate a population",
+        "Overrides are Hydra's: a group as in env=overcooked/cramped_room, scale=laptop, cluster=gpu_node or "
+        "tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for run.seed=1. "
+        "Keys of --json: run_id, run_dir, population (paths), matrix (mean and standard_error, row = seat 0, column = "
+        "seat 1), ledger (steps by member and kind), seconds; with --dry-run the whole configuration instead.",
+    )
+    run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
+    run.add_argument("--dry-run", action="store_true", help="check everything, print the configuration, start nothing")
+
+
+def _add_population_commands(commands: Any) -> None:
+    evaluate = _command(
+        commands,
+        "evaluate",
+        _evaluate,
+        "SP/XP matrix of a population, beside random and idle partners",
+        "Keys of --json: those of popgen/evaluation/report.py (sp, xp, matrix, beside, obstruction, pairs, ...) "
+        "and files.",
+    )
+    evaluate.add_argument("population", metavar="POPULATION", help="folder that holds manifest.json")
+    evaluate.add_argument("--episodes", type=_at_least(1), default=20, help="per ordered pair (%(default)s)")
+    evaluate.add_argument("--seed", type=_at_least(0), default=0, help="of the evaluation (%(default)s)")
+    evaluate.add_argument("--members", type=_numbers, default=None, metavar="1,2,...", help="all by default")
+    evaluate.add_argument("--out", metavar="DIR", help="of the report (POPULATION/evaluation)")
+    evaluate.add_argument("--env", metavar="NAME", help="refuse a population that was trained in another environment")
+    evaluate.add_argument(
+        "--param", type=_pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
+    )
+    show = _command(
+        commands,
+        "show",
+        _show,
+        "what a population holds",
+        "Keys of --json: path, manifest, members (member.json and total_steps).",
+    )
+    show.add_argument("population", metavar="POPULATION", help="folder that holds manifest.json")
+
+
+def _command(
+    commands: Any, name: str, command: Callable[[argparse.Namespace], int], summary: str, details: str
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=summary + ".", epilog=details)
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    parser.set_defaults(command=command)
+    return parser
+
+
+def _at_least(minimum: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
+        if not minimum <= value < 2**31:
+            raise argparse.ArgumentTypeError(f"must be at least {minimum} and below 2^31, got {value}")
+        return value
+
+    return parse
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
+    return value
+
+
+def _numbers(text: str) -> list[int]:
+    return [_at_least(1)(part) for part in text.split(",")]
+
+
+def _pair(text: str) -> tuple[str, Any]:
+    import yaml
+
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE, got {text!r}")
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise argparse.ArgumentTypeError(f"cannot read the value of {text!r}") from None

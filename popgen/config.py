@@ -1,0 +1,285 @@
+"""Frozen schemas, one per group of conf/, checked before anything starts.
+
+Every number that a method uses stands here with its range; `conf/` holds the values. The schemas know
+nothing of Hydra: the command line composes a plain dictionary and calls `RunConfig.parse`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationError, model_validator
+
+from popgen.errors import UserError
+
+
+def _a_number(value: Any) -> Any:
+    if isinstance(value, bool | str):
+        raise ValueError("Input should be a number")
+    return value
+
+
+_Int = Annotated[int, BeforeValidator(_a_number)]
+_Float = Annotated[float, BeforeValidator(_a_number), Field(allow_inf_nan=False)]
+Positive = Annotated[_Int, Field(ge=1)]
+NonNegative = Annotated[_Int, Field(ge=0)]
+Number = _Float
+Rate = Annotated[_Float, Field(gt=0.0, le=1.0)]
+Fraction = Annotated[_Float, Field(ge=0.0, le=1.0)]
+Weight = Annotated[_Float, Field(ge=0.0)]
+Text = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is int else value)]
+
+
+class Schema(BaseModel):
+    """Immutable, no unknown keys, no silent conversion of text to numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class EnvConfig(Schema):
+    """An environment of the registry; `params` go to its constructor."""
+
+    name: str = "overcooked/cramped_room"
+    params: dict[str, Any] = {}
+
+
+class PopulationConfig(Schema):
+    """Size of the population and, for continuing one, the run whose members it starts from."""
+
+    size: Positive = 3
+    init_from: str | None = None
+    init_members: Positive = 1
+
+
+class WorldModelConfig(Schema):
+    """The two-player RSSM (paper, section 4.1 and the table of XPM-WM hyper-parameters)."""
+
+    view: Literal["features", "lossless"] = "features"
+    encoder_layers: Positive = 2
+    decoder_layers: Positive = 2
+    cnn_kernels: tuple[Positive, ...] = (5, 3, 3)
+    cnn_channels: Positive = 32
+    units: Positive = 128
+    deter: Positive = 128
+    recurrent_units: NonNegative = 256
+    prior_layers: Positive = 1
+    posterior_layers: Positive = 1
+    head_layers: Positive = 2
+    groups: Positive = 32
+    joint_groups: Positive = 16
+    classes: Positive = 8
+    unimix: Fraction = 0.01
+    activation: Literal["silu", "leaky_relu"] = "silu"
+    norm: StrictBool = True
+    learning_rate: Rate = 2e-3
+    grad_clip: Weight = 100.0
+    batch: Positive = 64
+    length: Annotated[_Int, Field(ge=2)] = 8
+    kl_dyn: Weight = 1.0
+    kl_rep: Weight = 0.03
+    free_nats: Weight = 1.0
+    event_scale: Weight = 3.0
+    continue_scale: Weight = 1.0
+    kl_predecessors: Weight = 0.0
+    predecessors: Literal["partner", "latest", "all"] = "partner"
+
+    @model_validator(mode="after")
+    def _groups_divide(self) -> WorldModelConfig:
+        if self.joint_groups >= self.groups or (self.groups - self.joint_groups) % 2:
+            raise ValueError("joint_groups must leave an even, positive number of groups for the two players")
+        return self
+
+
+class AgentConfig(Schema):
+    """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim)."""
+
+    units: Positive = 128
+    layers: Positive = 2
+    activation: Literal["silu", "leaky_relu"] = "silu"
+    norm: StrictBool = True
+    actor_input: Literal["model", "latent"] = "model"
+    horizon: Positive = 15
+    starts_sp: Positive = 256
+    starts_xp: Positive = 128
+    discount: Fraction = 0.99
+    lam: Fraction = 0.95
+    actor_lr: Rate = 1e-3
+    critic_lr: Rate = 1e-3
+    entropy: Weight = 3e-3
+    grad_clip: Weight = 100.0
+    unimix: Fraction = 0.01
+    bins: Annotated[_Int, Field(ge=3)] = 65
+    slow_critic: Fraction = 0.98
+    return_percentiles: tuple[Number, Number] = (5.0, 95.0)
+    lambda_xp: Weight = 0.25
+    lambda_warmup: NonNegative = 0
+    sp_from_xp: Fraction = 0.5
+    xp_starts: Literal["partner", "any"] = "partner"
+    partner: Literal["max_window", "max_buffer"] = "max_window"
+    partner_random: Fraction = 0.3
+    precision: Literal["float32", "bfloat16"] = "float32"
+
+
+class ReplayConfig(Schema):
+    """B_SP and B_XP."""
+
+    capacity: Positive = 1_000_000
+    event_fraction: Fraction = 0.4
+
+
+class Phase1Config(Schema):
+    """Member 1: self-play together with the world model."""
+
+    envs: Positive = 64
+    prefill_steps: NonNegative = 256_000
+    prefill_interact: Fraction = 0.3
+    pretrain_updates: NonNegative = 600
+    steps_per_iteration: Positive = 100
+    model_updates: NonNegative = 25
+    agent_updates: Positive = 25
+    recent_fraction: Fraction = 0.0
+    max_steps: Positive = 680_000
+    restart_after: NonNegative = 0
+    restart_updates: NonNegative = 0
+    check_every: Positive = 5
+    target_score: Number = 11.0
+    patience: Positive = 1000
+
+
+class Phase2Config(Schema):
+    """Members 2..M: mostly imagination, few real episodes."""
+
+    first_updates: Positive = 600
+    updates_per_round: Positive = 200
+    model_updates: NonNegative = 60
+    model_lr: Rate = 5e-4
+    episodes_sp: Positive = 16
+    episodes_xp: Positive = 16
+    rounds: Positive = 4
+    max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
+    cache: Positive = 8192
+    starts_random: Fraction = 0.34
+    starts_event: Fraction = 0.30
+    starts_new: Fraction = 0.30
+    event_reach: Positive = 10
+    new_fraction: Fraction = 0.5
+
+
+class EvaluationConfig(Schema):
+    """Episodes behind each figure of the SP/XP matrix (per seating)."""
+
+    episodes: Positive = 20
+
+
+class ClusterConfig(Schema):
+    """Where actors run; `address=None` starts a local Ray."""
+
+    address: str | None = None
+    num_cpus: Positive | None = None
+    samplers: Positive = 1
+    sampler_cpus: Weight = 0.1
+    replay_cpus: Weight = 0.0
+    model_cpus: Weight = 0.9
+    agent_cpus: Weight = 0.9
+    model_gpus: Weight = 0.0
+    agent_gpus: Weight = 0.0
+    threads: Positive = 1
+    resources: dict[str, Weight] = {}
+
+
+class TrackingConfig(Schema):
+    """MLflow; without a URI a sqlite store in the run's folder."""
+
+    enabled: StrictBool = True
+    uri: str | None = None
+    experiment: str = "popgen"
+
+
+class RunSection(Schema):
+    """Identity and place of the run."""
+
+    id: Text | None = None
+    root: str = "runs"
+    seed: Annotated[_Int, Field(ge=0, lt=2**31)] = 0
+    schedule: Literal["sync", "async"] = "sync"
+    checkpoint_seconds: Weight = 60.0
+
+
+class RunConfig(Schema):
+    """The whole of one run."""
+
+    method: Literal["xpm_wm"] = "xpm_wm"
+    scale: str = "laptop"
+    env: EnvConfig = EnvConfig()
+    population: PopulationConfig = PopulationConfig()
+    world_model: WorldModelConfig = WorldModelConfig()
+    agent: AgentConfig = AgentConfig()
+    replay: ReplayConfig = ReplayConfig()
+    phase1: Phase1Config = Phase1Config()
+    phase2: Phase2Config = Phase2Config()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    cluster: ClusterConfig = ClusterConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    run: RunSection = RunSection()
+
+    @classmethod
+    def parse(cls, values: dict[str, Any]) -> RunConfig:
+        """Check a plain dictionary.
+
+        Raises:
+            UserError: for the first bad field, by its dotted name.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise _as_user_error(error) from None
+
+    def digest(self) -> str:
+        """sha256 of everything that decides the result (not of where it runs or is tracked)."""
+        kept = self.model_dump(mode="json", exclude={"cluster", "tracking", "run"})
+        kept["seed"], kept["schedule"] = self.run.seed, self.run.schedule
+        return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def field_names(schema: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[str]:
+    """Dotted names of all fields, sections included."""
+    for name, info in schema.model_fields.items():
+        yield prefix + name
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
+            yield from field_names(info.annotation, f"{prefix}{name}.")
+
+
+def closest_field(key: str) -> str | None:
+    """The field that a mistaken dotted key most likely means, by section, by last part, or by spelling."""
+    names = list(field_names())
+    leaves = [name for name in names if not any(other.startswith(f"{name}.") for other in names)]
+    section, _, last = key.rpartition(".")
+    siblings = [name for name in leaves if name.rpartition(".")[0] == section]
+    for choices, wanted in ((siblings, last), (leaves, last)):
+        parts = {name.rpartition(".")[2]: name for name in reversed(choices)}
+        close = difflib.get_close_matches(wanted, parts, n=1, cutoff=0.75)
+        if close:
+            return parts[close[0]]
+    close = difflib.get_close_matches(key, [name for name in names if not key.startswith(f"{name}.")], n=1, cutoff=0.75)
+    return close[0] if close else None
+
+
+def unknown_field(key: str) -> UserError:
+    """The error for a key that no schema has."""
+    known = closest_field(key)
+    return UserError(key, "there is no such field", f"did you mean {known}?" if known else "see `popgen run --dry-run`")
+
+
+def _as_user_error(error: ValidationError) -> UserError:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"]) or "config"
+    if first["type"] == "extra_forbidden":
+        return unknown_field(where)
+    got = first.get("input")
+    shown = "" if isinstance(got, BaseModel | dict) else f" (got {got!r})"
+    fix = "give it a value" if first["type"] == "missing" else "correct the value"
+    return UserError(where, first["msg"].removeprefix("Value error, ") + shown, fix)

@@ -1,0 +1,125 @@
+"""Sampling real environments: a batch of teams stepped together, handed on as segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from popgen.envs.base import BatchedEnv
+from popgen.policies.base import Policy
+from popgen.policies.seating import Seating
+from popgen.types import Kind, Segment
+
+
+@dataclass(frozen=True)
+class Team:
+    """`envs` environments in which `members` (seat 0, seat 1) play; the steps count as `kind`."""
+
+    kind: Kind
+    members: tuple[int, int]
+    envs: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One whole finished episode: its team, score (dishes), shaped event return and event counts (P, E)."""
+
+    kind: Kind
+    members: tuple[int, int]
+    score: float
+    shaped: float
+    events: np.ndarray
+
+
+class Sampler:
+    """Steps B environments with several teams at once; episodes go on from one `collect` to the next.
+
+    Args:
+        env: a batch of exactly as many environments as the teams ask for.
+        teams: who plays where, in order of the batch.
+        policies: member id -> policy; the random player is RANDOM_MEMBER.
+        name: of the sampler, for the ledger's key.
+        seed: of environments and policies.
+        stagger: spread the first ends of episodes over the horizon, so that data of all ages arrive together.
+        sequence: number of the first segment.
+    """
+
+    def __init__(
+        self,
+        env: BatchedEnv,
+        teams: list[Team],
+        policies: dict[int, Policy],
+        *,
+        name: str,
+        seed: int,
+        stagger: bool = False,
+        sequence: int = 0,
+    ) -> None:
+        if sum(team.envs for team in teams) != env.num_envs:
+            raise ValueError(f"teams ask for {sum(t.envs for t in teams)} environments, the batch has {env.num_envs}")
+        self.env, self.teams, self.name, self.sequence = env, teams, name, sequence
+        members = sorted({member for team in teams for member in team.members})
+        index = {member: position for position, member in enumerate(members)}
+        seats = np.concatenate([np.tile([[index[m] for m in team.members]], (team.envs, 1)) for team in teams])
+        self.policies = policies
+        self.seating = Seating([policies[member] for member in members], seats)
+        self.env.reset(seed=seed)
+        self.seating.reset(seed)
+        count = env.num_envs
+        self._whole = np.ones(count, bool)
+        if stagger:
+            self.env.set_time(np.arange(count) * env.spec.horizon // count)
+            self._whole[1:] = False
+        self._score = np.zeros(count)
+        self._counts = np.zeros((count, 2, env.spec.num_events), np.int64)
+        self._weights = np.asarray(env.spec.event_weights)
+
+    def collect(self, steps: int) -> tuple[list[Segment], list[Episode]]:
+        """Play `steps` joint steps: one segment per team, and the episodes that ended."""
+        env, count, spec = self.env, self.env.num_envs, self.env.spec
+        dtype = np.dtype(spec.state_dtype)
+        states = np.empty((steps, count, spec.state_size), dtype)
+        following = np.empty_like(states)
+        actions = np.empty((steps, count, 2), np.uint8)
+        events = np.empty((steps, count, 2, spec.num_events), np.uint8)
+        reward, score = np.empty((steps, count), np.float32), np.empty((steps, count), np.float32)
+        terminated, truncated = np.empty((steps, count), bool), np.empty((steps, count), bool)
+        episodes: list[Episode] = []
+        for t in range(steps):
+            states[t] = env.get_state()
+            actions[t] = self.seating.act({view: env.encode(states[t], view) for view in self.seating.views})
+            result = env.step(actions[t])
+            following[t] = env.get_state()
+            reward[t], score[t], events[t] = result.reward, result.score, result.events
+            terminated[t], truncated[t] = result.terminated, result.truncated
+            self._score += result.score
+            self._counts += result.events
+            if result.done.any():
+                episodes += self._finish(np.flatnonzero(result.done))
+            self.seating.ended(result.done)
+        return self._segments(states, following, actions, reward, score, events, terminated, truncated), episodes
+
+    def _finish(self, rows: np.ndarray) -> list[Episode]:
+        owners = np.repeat(np.arange(len(self.teams)), [team.envs for team in self.teams])
+        found = []
+        for row in rows:
+            team = self.teams[owners[row]]
+            if self._whole[row]:
+                shaped = float((self._counts[row] * self._weights).sum())
+                counts = self._counts[row].copy()
+                found.append(Episode(team.kind, team.members, float(self._score[row]), shaped, counts))
+        self.env.reset(indices=rows)
+        self._whole[rows], self._score[rows], self._counts[rows] = True, 0.0, 0
+        return found
+
+    def _segments(self, *columns: np.ndarray) -> list[Segment]:
+        names = ("states", "next_states", "actions", "reward", "score", "events", "terminated", "truncated")
+        segments, start = [], 0
+        for team in self.teams:
+            rows = slice(start, start + team.envs)
+            part = {name: np.ascontiguousarray(column[:, rows]) for name, column in zip(names, columns, strict=True)}
+            segments.append(Segment(team.kind, team.members, **part, sampler=self.name, sequence=self.sequence))
+            self.sequence += 1
+            start += team.envs
+        return segments

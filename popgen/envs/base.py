@@ -1,0 +1,116 @@
+"""The one protocol of popgen's environments: batched, exact, restartable from any state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from popgen.types import StepBatch
+
+
+@dataclass(frozen=True)
+class ViewSpec:
+    """One way to look at a state, as every player sees it.
+
+    Attributes:
+        shape: of one player's observation.
+        dtype: numpy dtype name.
+        binary: all entries are 0 or 1 (Bernoulli reconstruction is then exact).
+        scale: largest value an entry can take, to bring counts into [0, 1].
+        swap: for a flat view, index array with obs_of_player_1 == obs_of_player_0[swap]; else None.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    binary: bool
+    scale: float = 1.0
+    swap: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """Everything the rest of popgen knows about an environment.
+
+    Attributes:
+        name: registry name, such as `overcooked/cramped_room`.
+        horizon: steps after which an episode is truncated.
+        num_actions, action_names: the discrete actions of each player.
+        state_size, state_dtype: a state is one row of S numbers of this dtype.
+        views: name -> ViewSpec; `features` always exists and is flat.
+        event_names, event_weights: the event vector per player and its linear reward.
+        score_name: unit of `StepBatch.score`, such as `dishes`.
+        params: JSON-able parameters that make the same environment again through the registry.
+        fingerprint: sha256 over name-independent rules (grid and parameters): two environments
+            with the same fingerprint behave the same.
+    """
+
+    name: str
+    horizon: int
+    num_actions: int
+    action_names: tuple[str, ...]
+    state_size: int
+    state_dtype: str
+    views: dict[str, ViewSpec]
+    event_names: tuple[str, ...]
+    event_weights: tuple[float, ...]
+    score_name: str
+    params: dict[str, Any] = field(default_factory=dict)
+    fingerprint: str = ""
+    num_players: int = 2
+
+    @property
+    def num_events(self) -> int:
+        return len(self.event_names)
+
+
+class BatchedEnv(ABC):
+    """B copies of one environment stepped together by one seeded generator.
+
+    Nothing resets by itself: after a step with `done`, call `reset(indices=...)` for those rows.
+    """
+
+    spec: EnvSpec
+    num_envs: int
+
+    @abstractmethod
+    def reset(self, seed: int | None = None, indices: np.ndarray | None = None) -> None:
+        """Start new episodes in all (or the given) environments; `seed` restarts the generator."""
+
+    @abstractmethod
+    def step(self, actions: np.ndarray) -> StepBatch:
+        """Play joint `actions` (B, P); raises ValueError on a wrong shape or an unknown action."""
+
+    @abstractmethod
+    def get_state(self, indices: np.ndarray | None = None) -> np.ndarray:
+        """Copy of the states, (B, S): all that determines the future, the time step included."""
+
+    @abstractmethod
+    def set_state(self, states: np.ndarray, indices: np.ndarray | None = None) -> None:
+        """Continue from the given states; raises ValueError on a wrong shape or dtype."""
+
+    @abstractmethod
+    def encode(self, states: np.ndarray, view: str = "features") -> np.ndarray:
+        """Observations (..., P, *view.shape) of any states (..., S) of this environment."""
+
+    @abstractmethod
+    def time(self, states: np.ndarray) -> np.ndarray:
+        """Time step within the episode of any states (..., S) -> (...) int64."""
+
+    @abstractmethod
+    def set_time(self, time: np.ndarray) -> None:
+        """Overwrite the time steps (B,), to stagger the ends of a batch's episodes."""
+
+    @abstractmethod
+    def render_text(self, index: int = 0) -> str:
+        """The state of one environment as text."""
+
+    @abstractmethod
+    def render_rgb(self, index: int = 0) -> np.ndarray:
+        """The state of one environment as an (H, W, 3) uint8 picture."""
+
+    def observe(self, view: str = "features") -> np.ndarray:
+        """Observations (B, P, *view.shape) of the current states."""
+        return self.encode(self.get_state(), view)

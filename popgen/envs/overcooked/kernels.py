@@ -1,0 +1,336 @@
+"""The compiled core: one step of a batch of kitchens, and their observations.
+
+A state is one row of bytes: cells of players 1 and 2, their orientations, what they hold, the time step (low byte
+first), two bytes per pot (contents, cooking) and one byte per counter that a player can reach. Cells are y * W + x;
+orientations and moves are 0 north, 1 south, 2 east, 3 west; action 4 stays and 5 interacts. Objects: 0 nothing,
+1 onion, 2 tomato, 3 dish, then the soups in the order of rules.SOUPS. Cooking: 0 not cooking, 1 ready, 1 + r cooking
+with r steps to go. Tables are described in tables.py. All kernels are in this one file because numba's cache looks
+only at the file of the compiled function.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+# bytes of the state row
+ORIENT, HELD, TIME, POTS = 2, 4, 6, 8
+# rows of the table
+NEXT, FACE, KIND, SLOT, ADD_ONION, ADD_TOMATO, COOK, FULL = 0, 4, 8, 9, 10, 11, 12, 13
+FLOOR, XFIRST, ITEM_BIT, POT_BIT, SOUP_ONIONS, SOUP_TOMATOES, POT_CELL, COUNTER_CELL, NUM_ROWS = (
+    14, 15, 16, 19, 22, 23, 24, 25, 26,
+)  # fmt: skip
+# entries of meta
+M_POTS, M_COUNTERS, M_HORIZON, M_AUTO, M_RAW, M_FLOOR, M_ITEM, M_POT, M_COOK, M_FEATURES, M_CELLS, NUM_META = range(12)
+# kinds of cells
+WALL, COUNTER, ONIONS, TOMATOES, DISHES, POT, SERVE = range(7)
+# events
+TAKES_INGREDIENT, TAKES_DISH, POTS_INGREDIENT, TAKES_SOUP, DELIVERS_SOUP, NUM_EVENTS = range(6)
+# actions and objects
+STAY, INTERACT, NUM_ACTIONS = 4, 5, 6
+ONION, TOMATO, DISH, FIRST_SOUP = 1, 2, 3, 4
+# lossless channels, in overcooked_ai's order: players, orientations, terrain, contents, urgency
+CHANNELS, C_TERRAIN, C_IN_POT, C_IN_SOUP, C_COOK, C_DONE, C_DISH, C_ONION, C_TOMATO, C_URGENCY = (
+    26, 10, 16, 18, 20, 21, 22, 23, 24, 25,
+)  # fmt: skip
+URGENT_BELOW = 40
+
+
+@njit(_nrt=False)
+def _counter_pickup_event(item):
+    """overcooked_ai's own log counts pick-ups from counters too."""
+    if item == DISH:
+        return TAKES_DISH
+    return TAKES_SOUP if item >= FIRST_SOUP else TAKES_INGREDIENT
+
+
+@njit(_nrt=False)
+def _use_pot(states, held, slot, table, auto):
+    """Interact with the pot whose contents stand at `slot`; returns the event or NUM_EVENTS."""
+    item, contents, cooking = states[held], states[slot], states[slot + 1]
+    if item == 0:
+        if not auto and contents != 0 and cooking == 0:
+            states[slot + 1] = 1 + table[COOK, contents]
+    elif item == DISH:
+        if cooking == 1:
+            states[held] = contents
+            states[slot] = 0
+            states[slot + 1] = 0
+            return TAKES_SOUP
+    elif item < DISH and cooking == 0:
+        mixed = table[ADD_ONION if item == ONION else ADD_TOMATO, contents]
+        if mixed > 0:
+            states[slot] = mixed
+            states[held] = 0
+            return POTS_INGREDIENT
+    return NUM_EVENTS
+
+
+@njit(_nrt=False)
+def _interact(states, s, p, table, auto, raw):
+    """Resolve player p's interact in the state at states[s:]; returns the event it causes, or NUM_EVENTS."""
+    cell = table[FACE + (states[s + ORIENT + p] & 3), states[s + p]]
+    kind, slot, held = table[KIND, cell], s + table[SLOT, cell], s + HELD + p
+    item = states[held]
+    if kind == POT:
+        return _use_pot(states, held, slot, table, auto)
+    if kind == COUNTER:
+        there = states[slot]
+        if (item == 0) != (there == 0):
+            states[held] = there
+            states[slot] = item
+            if raw and there != 0:
+                return _counter_pickup_event(there)
+    elif kind == SERVE:
+        if item >= FIRST_SOUP:
+            states[held] = 0
+            return DELIVERS_SOUP
+    elif item == 0 and kind == DISHES:
+        states[held] = DISH
+        return TAKES_DISH
+    elif item == 0 and kind != WALL:
+        states[held] = ONION if kind == ONIONS else TOMATO
+        # overcooked_ai 1.1.0 does not log tomatoes taken at a dispenser
+        return NUM_EVENTS if raw and kind == TOMATOES else TAKES_INGREDIENT
+    return NUM_EVENTS
+
+
+@njit(_nrt=False)
+def _move(states, s, first, second, table):
+    """Turn and move both players; if they would meet or cross, both stay where they are."""
+    old0, old1 = states[s], states[s + 1]
+    new0, new1 = old0, old1
+    if first < STAY:
+        states[s + ORIENT] = first
+        new0 = table[NEXT + first, old0]
+    if second < STAY:
+        states[s + ORIENT + 1] = second
+        new1 = table[NEXT + second, old1]
+    if new0 != new1 and not (new0 == old1 and new1 == old0):
+        states[s] = new0
+        states[s + 1] = new1
+
+
+@njit(_nrt=False)
+def _cook(states, s, pots, table, auto):
+    """Full pots begin by themselves under automatic cooking; cooking pots advance by one."""
+    for slot in range(s + POTS, s + POTS + 2 * pots, 2):
+        cooking = states[slot + 1]
+        if auto and cooking == 0 and table[FULL, states[slot]] == 1:
+            cooking = 1 + table[COOK, states[slot]]
+            states[slot + 1] = cooking
+        if cooking > 1:
+            states[slot + 1] = cooking - 1
+
+
+@njit(cache=True, _nrt=False)
+def step(states, size, actions, table, values, meta, reward, score, events, truncated):
+    """Step N kitchens in place.
+
+    Args:
+        states: (N * S,) uint8, changed.  size: S.
+        actions: (N, 2) uint8 below NUM_ACTIONS.
+        table, values, meta: see tables.Tables.
+        reward, score: (N,) float32.  events: (N, 2, NUM_EVENTS) uint8, zeros.  truncated: (N,) bool.  All written.
+    """
+    auto, raw, pots, horizon = meta[M_AUTO] == 1, meta[M_RAW] == 1, meta[M_POTS], meta[M_HORIZON]
+    for n in range(actions.shape[0]):
+        s = n * size
+        total, paid = values[0], 0
+        for p in range(2):
+            if actions[n, p] == INTERACT:
+                item = states[s + HELD + p]
+                event = _interact(states, s, p, table, auto, raw)
+                if event < NUM_EVENTS:
+                    events[n, p, event] = 1
+                if event == DELIVERS_SOUP:
+                    total += values[item]
+                    paid += 1 if values[item] > 0 else 0
+        _move(states, s, actions[n, 0], actions[n, 1], table)
+        _cook(states, s, pots, table, auto)
+        time = min(states[s + TIME] + 256 * states[s + TIME + 1] + 1, 65535)
+        states[s + TIME] = time & 255
+        states[s + TIME + 1] = time >> 8
+        reward[n] = total
+        score[n] = paid
+        truncated[n] = time >= horizon
+
+
+@njit(_nrt=False)
+def _set_item(out, at, item, table, bit_row):
+    """Set the bits of an object; objects that cannot exist here have none."""
+    first = table[bit_row, item]
+    if first >= 0:
+        out[at + first] = 1
+        out[at + table[bit_row + 1, item]] = 1
+        out[at + table[bit_row + 2, item]] = 1
+
+
+@njit(_nrt=False)
+def _player_features(states, s, p, table, floor, items, out, at):
+    """Players' part of one view at out[at:]; p's own entries come first."""
+    for i in range(2):
+        player = p if i == 0 else 1 - p
+        cell = table[FLOOR, states[s + player]]
+        if cell >= 0:
+            out[at + i * floor + cell] = 1
+        out[at + 2 * floor + 4 * i + (states[s + ORIENT + player] & 3)] = 1
+        item = states[s + HELD + player]
+        if item != 0:
+            _set_item(out, at + 2 * floor + 8 + i * items, item, table, ITEM_BIT)
+
+
+@njit(_nrt=False)
+def _world_features(states, s, table, meta, out, at):
+    """The part of the view that both players share, at out[at:]."""
+    pots, cook, pot_bits, items = meta[M_POTS], meta[M_COOK], meta[M_POT], meta[M_ITEM]
+    slot = s + POTS
+    for _ in range(pots):
+        contents, cooking = states[slot], states[slot + 1]
+        if contents != 0:
+            _set_item(out, at, contents, table, POT_BIT)
+            if 0 < cooking <= cook:
+                out[at + pot_bits + cooking - 1] = 1
+        at += pot_bits + cook
+        slot += 2
+    for _ in range(meta[M_COUNTERS]):
+        if states[slot] != 0:
+            _set_item(out, at, states[slot], table, ITEM_BIT)
+        at += items
+        slot += 1
+    if meta[M_HORIZON] - (states[s + TIME] + 256 * states[s + TIME + 1]) < URGENT_BELOW:
+        out[at] = 1
+
+
+@njit(cache=True, _nrt=False)
+def encode_features(states, size, table, meta, out):
+    """`features` of both players, all of `out` written.
+
+    Args:
+        states: (N * S,) uint8.  size: S.  table, meta: see tables.Tables.
+        out: (N * 2 * F,) uint8.
+    """
+    length, floor, items = meta[M_FEATURES], meta[M_FLOOR], meta[M_ITEM]
+    shared = 2 * floor + 8 + 2 * items
+    for i in range(out.shape[0]):
+        out[i] = 0
+    at = 0
+    for s in range(0, states.shape[0], size):
+        for p in range(2):
+            _player_features(states, s, p, table, floor, items, out, at)
+            _world_features(states, s, table, meta, out, at + shared)
+            at += length
+
+
+@njit(_nrt=False)
+def _lossless_soup(out, at, contents, cooking, table, idle):
+    """A soup in a pot (idle or not), in a hand or on a counter."""
+    start = at + (C_IN_POT if idle else C_IN_SOUP)
+    out[start] = table[SOUP_ONIONS, contents]
+    out[start + 1] = table[SOUP_TOMATOES, contents]
+    if not idle:
+        out[at + C_COOK] = cooking - 1
+        if cooking == 1:
+            out[at + C_DONE] = 1
+
+
+@njit(_nrt=False)
+def _lossless_item(out, at, item, table):
+    if item >= FIRST_SOUP:
+        _lossless_soup(out, at, item, 1, table, False)
+    elif item == DISH:
+        out[at + C_DISH] = 1
+    elif item == ONION:
+        out[at + C_ONION] = 1
+    elif item == TOMATO:
+        out[at + C_TOMATO] = 1
+
+
+@njit(_nrt=False)
+def _lossless_view(states, s, p, table, meta, walls, out, at):
+    """Lossless encoding of one state for player p into out[at : at + W * H * CHANNELS], zeros so far."""
+    for i in range(walls.shape[0]):
+        out[at + walls[i]] = 1
+    if meta[M_HORIZON] - (states[s + TIME] + 256 * states[s + TIME + 1]) < URGENT_BELOW:
+        for cell in range(meta[M_CELLS]):
+            out[at + cell * CHANNELS + C_URGENCY] = 1
+    for i in range(2):
+        player = p if i == 0 else 1 - p
+        here = at + table[XFIRST, states[s + player]] * CHANNELS
+        out[here + i] = 1
+        out[here + 2 + 4 * i + (states[s + ORIENT + player] & 3)] = 1
+        _lossless_item(out, here, states[s + HELD + player], table)
+    slot = s + POTS
+    for i in range(meta[M_POTS]):
+        contents, cooking = states[slot], states[slot + 1]
+        if contents != 0:
+            _lossless_soup(out, at + table[POT_CELL, i] * CHANNELS, contents, cooking, table, cooking == 0)
+        slot += 2
+    for i in range(meta[M_COUNTERS]):
+        if states[slot + i] != 0:
+            _lossless_item(out, at + table[COUNTER_CELL, i] * CHANNELS, states[slot + i], table)
+
+
+@njit(cache=True, _nrt=False)
+def encode_lossless(states, size, players, table, meta, walls, out):
+    """overcooked_ai's lossless encoding of the first `players` players, all of `out` written.
+
+    Args:
+        states: (N * S,) uint8.  size: S.  players: 1 or 2.  table, meta, walls: see tables.Tables.
+        out: (N * players * W * H * CHANNELS,) uint8.
+    """
+    for i in range(out.shape[0]):
+        out[i] = 0
+    at = 0
+    for s in range(0, states.shape[0], size):
+        for p in range(players):
+            _lossless_view(states, s, p, table, meta, walls, out, at)
+            at += meta[M_CELLS] * CHANNELS
+
+
+@njit(_nrt=False)
+def _first_set(features, start, count):
+    for i in range(count):
+        if features[start + i] != 0:
+            return i
+    return -1
+
+
+@njit(_nrt=False)
+def _bits(features, start, count):
+    value = 0
+    for i in range(count):
+        if features[start + i] != 0:
+            value += 1 << i
+    return value
+
+
+@njit(_nrt=False)
+def _decode_world(features, start, meta, codes, row):
+    pots, pot_bits, cook, items = meta[M_POTS], meta[M_POT], meta[M_COOK], meta[M_ITEM]
+    for i in range(pots):
+        row[POTS + 2 * i] = codes[1, _bits(features, start, pot_bits)]
+        row[POTS + 2 * i + 1] = _first_set(features, start + pot_bits, cook) + 1
+        start += pot_bits + cook
+    slot = POTS + 2 * pots
+    for i in range(meta[M_COUNTERS]):
+        row[slot + i] = codes[0, _bits(features, start, items)]
+        start += items
+    time = max(0, meta[M_HORIZON] - URGENT_BELOW + 1) if features[start] != 0 else 0
+    row[TIME] = time & 255
+    row[TIME + 1] = time >> 8
+
+
+@njit(cache=True, _nrt=False)
+def decode_features(features, meta, codes, out):
+    """One player's `features` (N, F) -> states (N, S) uint8 in which that player is the first.
+
+    The time step is not in the features: it is set to 0, or to the first urgent one.
+    """
+    floor, items = meta[M_FLOOR], meta[M_ITEM]
+    for n in range(features.shape[0]):
+        view, row = features[n], out[n]
+        for i in range(2):
+            row[i] = codes[2, max(0, _first_set(view, i * floor, floor))]
+            row[ORIENT + i] = max(0, _first_set(view, 2 * floor + 4 * i, 4))
+            row[HELD + i] = codes[0, _bits(view, 2 * floor + 8 + i * items, items)]
+        _decode_world(view, 2 * floor + 8 + 2 * items, meta, codes, row)

@@ -1,0 +1,152 @@
+"""What a recipe pays and how long it cooks, from the order and recipe keys of a layout file.
+
+The keys and their precedence are those of overcooked_ai 1.1.0. Soups are known only by their counts of
+onions and tomatoes; each has one object code.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from popgen.errors import UserError
+
+NOTHING, ONION, TOMATO, DISH = 0, 1, 2, 3
+FIRST_SOUP = 4
+MAX_INGREDIENTS = 3
+MAX_COOK_TIME = 250  # a pot's byte also tells idle and ready
+
+SOUPS: tuple[tuple[int, int], ...] = tuple(
+    (total - tomatoes, tomatoes) for total in range(1, MAX_INGREDIENTS + 1) for tomatoes in range(total + 1)
+)
+"""(onions, tomatoes) of soup code FIRST_SOUP + i."""
+
+SOUP_CODE: dict[tuple[int, int], int] = {soup: FIRST_SOUP + i for i, soup in enumerate(SOUPS)}
+NUM_CODES = FIRST_SOUP + len(SOUPS)
+
+_ORDER_KEYS = ("start_all_orders", "start_bonus_orders", "order_bonus", "start_state")
+_RECIPE_KEYS = (
+    "recipe_values", "recipe_times", "delivery_reward", "cook_time", "max_num_ingredients",
+    "onion_value", "tomato_value", "onion_time", "tomato_time",
+)  # fmt: skip
+_IGNORED_KEYS = ("rew_shaping_params", "layout_name", "num_items_for_soup", "old_dynamics", "unused")
+_CLASHES = (
+    ("tomato_value", "delivery_reward"), ("tomato_value", "recipe_values"), ("recipe_values", "delivery_reward"),
+    ("tomato_time", "cook_time"), ("tomato_time", "recipe_times"), ("recipe_times", "cook_time"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Resolved recipe rules: `reward` and `cook_time` per (onions, tomatoes), and what a full pot holds."""
+
+    reward: dict[tuple[int, int], float]
+    cook_time: dict[tuple[int, int], int]
+    max_ingredients: int
+
+    def pot_contents(self, onions: bool, tomatoes: bool, initial: Iterable[tuple[int, int]] = ()) -> list[tuple[int, int]]:
+        """All that pots can hold, from empty or `initial` pots, when these ingredients can be had."""
+        found, front = set(initial), [(0, 0), *initial]
+        while front:
+            o, t = front.pop()
+            for more in [(o + 1, t)] * onions + [(o, t + 1)] * tomatoes:
+                if sum(more) <= self.max_ingredients and more not in found:
+                    found.add(more)
+                    front.append(more)
+        return [soup for soup in SOUPS if soup in found]
+
+    def is_full(self, soup: tuple[int, int]) -> bool:
+        return sum(soup) >= self.max_ingredients
+
+
+def rule_keys(config: Mapping[str, Any], field: str) -> dict[str, Any]:
+    """The keys of a layout file that matter to the rules.
+
+    Raises:
+        UserError: a key that no layout file has.
+    """
+    known = _ORDER_KEYS + _RECIPE_KEYS
+    for key in config:
+        if key not in known + _IGNORED_KEYS:
+            close = difflib.get_close_matches(str(key), known, 1)
+            raise UserError(field, f"unknown key {key!r}", f"did you mean {close[0]!r}?" if close else "remove it")
+    return {key: config[key] for key in known if key in config}
+
+
+def resolve(config: Mapping[str, Any], field: str) -> Rules:
+    """Rewards and cook times of every soup.
+
+    Args:
+        config: the rule keys of a layout (see `rule_keys`).
+        field: what to blame in errors.
+
+    Raises:
+        UserError: keys that exclude each other, or values overcooked_ai would not take.
+    """
+    _check_clashes(config, field)
+    size = config.get("max_num_ingredients", MAX_INGREDIENTS)
+    if size not in range(1, MAX_INGREDIENTS + 1):
+        raise UserError(field, f"max_num_ingredients must be 1 to {MAX_INGREDIENTS}, got {size!r}")
+    named = list(_recipes(config.get("start_all_orders") or [], field))
+    # a start state brings its own orders, and an empty list means every recipe
+    start = config.get("start_state")
+    orders = list(_recipes((start.get("all_orders") if start else config.get("start_all_orders")) or [], field))
+    bonus = list(_recipes((start.get("bonus_orders") if start else config.get("start_bonus_orders")) or [], field))
+    soups = [soup for soup in SOUPS if sum(soup) <= size]
+    orders = orders or soups
+    for name, listed in (("start_all_orders", orders), ("start_bonus_orders", bonus)):
+        if len(set(listed)) != len(listed):
+            raise UserError(field, f"{name} holds a recipe twice", "remove the duplicate")
+    if not set(bonus) <= set(orders):
+        raise UserError(field, "start_bonus_orders holds a recipe that start_all_orders does not", "add it to both")
+    factor = config.get("order_bonus", 2)
+    reward, cook_time = {}, {}
+    for soup in soups:
+        value = _figure(config, soup, named, "delivery_reward", "recipe_values", "value")
+        reward[soup] = float(value * (factor if soup in bonus else 1)) if soup in orders else 0.0
+        cook_time[soup] = _cook_time(_figure(config, soup, named, "cook_time", "recipe_times", "time"), field)
+    return Rules(reward, cook_time, size)
+
+
+def _check_clashes(config: Mapping[str, Any], field: str) -> None:
+    for one, other in _CLASHES:
+        if one in config and other in config:
+            raise UserError(field, f"{one} and {other} exclude each other", "remove one of them")
+    for kind in ("time", "value"):
+        if (f"onion_{kind}" in config) != (f"tomato_{kind}" in config):
+            raise UserError(field, f"onion_{kind} and tomato_{kind} come together", "give both or neither")
+    for key in ("recipe_values", "recipe_times"):
+        if key in config and len(config[key]) != len(config.get("start_all_orders") or []):
+            raise UserError(field, f"{key} must be as long as start_all_orders", "give one figure per order")
+
+
+def _recipes(orders: Iterable[Any], field: str) -> Iterable[tuple[int, int]]:
+    for order in orders:
+        try:
+            names = list(order["ingredients"])
+        except (TypeError, KeyError):
+            raise UserError(field, f"order {order!r} has no ingredients", "write {'ingredients': ['onion']}") from None
+        soup = (names.count("onion"), names.count("tomato"))
+        if sum(soup) != len(names) or soup not in SOUP_CODE:
+            raise UserError(field, f"order {names!r} is no recipe", "use one to three of 'onion' and 'tomato'")
+        yield soup
+
+
+def _figure(config: Mapping[str, Any], soup: tuple[int, int], named: list, fixed: str, table: str, kind: str) -> Any:
+    """One recipe's value or time; as in overcooked_ai a fixed figure or an ingredient's figure of 0 counts as absent."""
+    if config.get(fixed):
+        return config[fixed]
+    if config.get(table) and soup in named:
+        return config[table][named.index(soup)]
+    onion, tomato = config.get(f"onion_{kind}"), config.get(f"tomato_{kind}")
+    if onion and tomato:
+        return onion * soup[0] + tomato * soup[1]
+    return 20
+
+
+def _cook_time(value: Any, field: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_COOK_TIME:
+        raise UserError(field, f"a cook time must be a whole number from 0 to {MAX_COOK_TIME}, got {value!r}")
+    return value

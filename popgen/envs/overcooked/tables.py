@@ -1,0 +1,169 @@
+"""A layout and its rules as the flat arrays that the compiled kernels read.
+
+Every table has 256 columns and is indexed by a byte of the state, so that no state, however wrong, makes a
+kernel read or write outside its arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from popgen.envs.overcooked import kernels as k
+from popgen.envs.overcooked.layout import DIRECTIONS, Layout
+from popgen.envs.overcooked.rules import DISH, FIRST_SOUP, NOTHING, ONION, SOUP_CODE, SOUPS, TOMATO, Rules
+
+KINDS = {"X": k.COUNTER, "O": k.ONIONS, "T": k.TOMATOES, "D": k.DISHES, "P": k.POT, "S": k.SERVE}
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What the kernels need besides states, and the names of what they write.
+
+    Attributes:
+        table: (k.NUM_ROWS, 256) int16, see the row names in kernels.py.
+        values: (256,) float32, joint reward for delivering each object code.
+        meta: (k.NUM_META,) int64, sizes and switches.
+        codes: (4, 512) int16, inverse of the feature bits: object codes by held/counter bits (row 0) and by pot
+            bits (row 1), cell index by walkable feature (row 2), x-first index by cell (row 3).
+        walls: (cells that are not floor,) int64, where the lossless encoding of the grid itself is 1.
+        counters, pots: cells (x, y) in the order of the state row.
+        feature_names: one name per entry of the `features` view, for people.
+    """
+
+    table: np.ndarray
+    values: np.ndarray
+    meta: np.ndarray
+    codes: np.ndarray
+    walls: np.ndarray
+    counters: list[tuple[int, int]]
+    pots: list[tuple[int, int]]
+    feature_names: tuple[str, ...]
+
+
+def build_tables(
+    layout: Layout,
+    rules: Rules,
+    contents: list[tuple[int, int]],
+    soups: list[tuple[int, int]],
+    *,
+    auto: bool,
+    raw: bool,
+    horizon: int,
+) -> Tables:
+    """Lay out one environment's tables.
+
+    Args:
+        contents: (onions, tomatoes) of all that a pot can hold.
+        soups: those of them that can be cooking or cooked.
+    """
+    table = np.full((k.NUM_ROWS, 256), -1, np.int16)
+    table[k.NEXT : k.NEXT + 4] = np.arange(256)
+    table[k.FACE : k.FACE + 4] = np.arange(256)
+    table[[k.KIND, k.SLOT, k.COOK, k.FULL, k.ADD_ONION, k.ADD_TOMATO, k.SOUP_ONIONS, k.SOUP_TOMATOES, k.XFIRST]] = 0
+    pots, counters = layout.usable("P"), layout.usable("X")
+    _fill_cells(table, layout, pots, counters)
+    _fill_recipes(table, rules)
+    values = np.zeros(256, np.float32)
+    for soup, reward in rules.reward.items():
+        values[SOUP_CODE[soup]] = reward
+
+    ingredients = [code for mark, code in (("O", ONION), ("T", TOMATO)) if layout.usable(mark)]
+    codes = np.zeros((4, 512), np.int16)
+    items = [*ingredients, DISH, *(SOUP_CODE[soup] for soup in soups)]
+    item_names = _fill_bits(table, codes, k.ITEM_BIT, 0, items, items_too=True)
+    pot_names = _fill_bits(table, codes, k.POT_BIT, 1, [SOUP_CODE[soup] for soup in contents], items_too=False)
+    cook = max(1, max(rules.cook_time[soup] for soup in soups))
+    floor = layout.floor
+    codes[2, : len(floor)] = [_cell(layout, cell) for cell in floor]
+    codes[3, :256] = table[k.XFIRST]
+    meta = np.zeros(k.NUM_META, np.int64)
+    meta[k.M_POTS], meta[k.M_COUNTERS], meta[k.M_HORIZON] = len(pots), len(counters), horizon
+    meta[k.M_AUTO], meta[k.M_RAW] = auto, raw
+    meta[k.M_FLOOR], meta[k.M_ITEM], meta[k.M_POT], meta[k.M_COOK] = len(floor), len(item_names), len(pot_names), cook
+    names = _names(floor, item_names, pots, pot_names, cook, counters)
+    meta[k.M_FEATURES], meta[k.M_CELLS] = len(names), layout.width * layout.height
+    return Tables(table, values, meta, codes, _lossless_walls(layout), counters, pots, names)
+
+
+def _cell(layout: Layout, cell: tuple[int, int]) -> int:
+    return cell[1] * layout.width + cell[0]
+
+
+def _fill_cells(table: np.ndarray, layout: Layout, pots: list, counters: list) -> None:
+    for cell in [(x, y) for y in range(layout.height) for x in range(layout.width)]:
+        index = _cell(layout, cell)
+        table[k.XFIRST, index] = cell[0] * layout.height + cell[1]
+        if layout.tile(cell) != " ":
+            table[k.KIND, index] = KINDS[layout.tile(cell)] if layout.users(cell) else k.WALL
+            continue
+        for d, (dx, dy) in enumerate(DIRECTIONS):
+            ahead = (cell[0] + dx, cell[1] + dy)
+            table[k.FACE + d, index] = _cell(layout, ahead)
+            if layout.tile(ahead) == " ":
+                table[k.NEXT + d, index] = _cell(layout, ahead)
+    for i, cell in enumerate(layout.floor):
+        table[k.FLOOR, _cell(layout, cell)] = i
+    for i, cell in enumerate(pots):
+        table[k.SLOT, _cell(layout, cell)] = k.POTS + 2 * i
+        table[k.POT_CELL, i] = table[k.XFIRST, _cell(layout, cell)]
+    for i, cell in enumerate(counters):
+        table[k.SLOT, _cell(layout, cell)] = k.POTS + 2 * len(pots) + i
+        table[k.COUNTER_CELL, i] = table[k.XFIRST, _cell(layout, cell)]
+
+
+def _fill_recipes(table: np.ndarray, rules: Rules) -> None:
+    table[k.ADD_ONION, NOTHING], table[k.ADD_TOMATO, NOTHING] = SOUP_CODE[1, 0], SOUP_CODE[0, 1]
+    for (onions, tomatoes), code in SOUP_CODE.items():
+        table[k.SOUP_ONIONS, code], table[k.SOUP_TOMATOES, code] = onions, tomatoes
+        if onions + tomatoes > rules.max_ingredients:
+            continue
+        table[k.COOK, code] = rules.cook_time[onions, tomatoes]
+        if onions + tomatoes == rules.max_ingredients:
+            table[k.FULL, code] = 1
+        else:
+            table[k.ADD_ONION, code] = SOUP_CODE[onions + 1, tomatoes]
+            table[k.ADD_TOMATO, code] = SOUP_CODE[onions, tomatoes + 1]
+
+
+def _fill_bits(table: np.ndarray, codes: np.ndarray, row: int, inverse: int, present: list[int], *, items_too: bool) -> list[str]:
+    """Choose the bits that tell the objects apart and tabulate them; returns the bits' names.
+
+    Soups are thermometers of onions and of tomatoes; a bit that is always 0, or always equal to an earlier one,
+    is left out (with only one possible soup, one bit says it is there).
+    """
+    tests = [(f"{'onion tomato dish'.split()[code - 1]}", lambda c, code=code: c == code) for code in (ONION, TOMATO, DISH)]
+    tests = tests if items_too else []
+    for column, ingredient in ((0, "onions"), (1, "tomatoes")):
+        for level in (1, 2, 3):
+            tests.append((f"soup_{ingredient}>={level}", lambda c, i=column, n=level: c >= FIRST_SOUP and SOUPS[c - FIRST_SOUP][i] >= n))
+    kept: dict[tuple[bool, ...], str] = {}
+    for name, test in tests:
+        pattern = tuple(test(code) for code in present)
+        if any(pattern) and pattern not in kept:
+            kept[pattern] = name
+    for i, code in enumerate(present):
+        bits = [bit for bit, pattern in enumerate(kept) if pattern[i]]
+        table[row : row + 3, code] = (bits + bits[-1:] * 3)[:3]  # repeats are harmless: the kernel only sets bits
+        codes[inverse, sum(1 << bit for bit in bits)] = code
+    return list(kept.values())
+
+
+def _names(floor: list, items: list[str], pots: list, pot_bits: list[str], cook: int, counters: list) -> tuple[str, ...]:
+    who, sides = ("self", "other"), ("north", "south", "east", "west")
+    names = [f"{w}_at_{x},{y}" for w in who for x, y in floor]
+    names += [f"{w}_faces_{side}" for w in who for side in sides]
+    names += [f"{w}_holds_{item}" for w in who for item in items]
+    for x, y in pots:
+        names += [f"pot_{x},{y}_{bit}" for bit in pot_bits] + [f"pot_{x},{y}_cooks_{left}" for left in range(cook)]
+    names += [f"counter_{x},{y}_{item}" for x, y in counters for item in items]
+    return (*names, "urgency")
+
+
+def _lossless_walls(layout: Layout) -> np.ndarray:
+    base = np.zeros((layout.width, layout.height, k.CHANNELS), np.uint8)
+    for channel, mark in enumerate("PXOTDS", start=k.C_TERRAIN):
+        for x, y in layout.cells(mark):
+            base[x, y, channel] = 1
+    return np.flatnonzero(base)

@@ -1,0 +1,164 @@
+"""PettingZoo ParallelEnv view of any environment of the registry."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from popgen.envs.base import BatchedEnv, ViewSpec
+from popgen.envs.registry import make_env
+from popgen.errors import UserError
+from popgen.types import StepBatch
+
+REWARDS = ("environment", "events")
+RENDER_MODES = ("rgb_array", "ansi")
+
+
+class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
+    """One environment as `player_0` and `player_1`.
+
+    Observations are those of one view, of its shape and dtype. Both players get the same reward; infos hold the
+    player's own `events` (name -> count) and the team's `score`. Like every ParallelEnv it must be reset after the
+    agents have left (`agents` is empty).
+
+    Args:
+        env: batched environment with one copy.
+        view: `features`, or another view of the environment such as `lossless`.
+        reward: `environment`, the environment's own joint reward, or `events`, the weighted events of both players.
+        render_mode: `rgb_array`, `ansi` or None.
+
+    Raises:
+        UserError: more than one copy, or an unknown view, reward or render mode.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "popgen",
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 5,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self, env: BatchedEnv, *, view: str = "features", reward: str = "environment", render_mode: str | None = None
+    ) -> None:
+        if env.num_envs != 1:
+            raise UserError("num_envs", f"a ParallelEnv shows one environment, got {env.num_envs}", "use num_envs=1")
+        _choose("view", view, tuple(env.spec.views))
+        _choose("reward", reward, REWARDS)
+        _choose("render_mode", render_mode, (None, *RENDER_MODES))
+        self.env, self.view, self.reward, self.render_mode = env, view, reward, render_mode
+        self.metadata = {**type(self).metadata, "name": env.spec.name}
+        self.possible_agents = [f"player_{player}" for player in range(env.spec.num_players)]
+        self.agents: list[str] = []
+        seen = env.spec.views[view]
+        self.observation_spaces = {agent: _space(seen, seen.shape) for agent in self.possible_agents}
+        self.action_spaces = {agent: spaces.Discrete(env.spec.num_actions) for agent in self.possible_agents}
+        self.state_space = _space(seen, (env.spec.num_players, *seen.shape))
+        self._weights = np.asarray(env.spec.event_weights, dtype=np.float64)
+
+    def observation_space(self, agent: str) -> spaces.Space:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space:
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """Start an episode, or continue from the state row `options["state"]` (S,); other options are ignored.
+
+        Raises:
+            ValueError: `options["state"]` is not a state of this environment.
+        """
+        self.env.reset(seed=seed)
+        if options and options.get("state") is not None:
+            row = options["state"]
+            row = row if isinstance(row, np.ndarray) else np.asarray(row, dtype=self.env.spec.state_dtype)
+            self.env.set_state(row[None])
+        self.agents = list(self.possible_agents)
+        nothing = np.zeros((len(self.agents), self.env.spec.num_events), dtype=np.uint8)
+        return self._observations(), self._infos(nothing, 0.0)
+
+    def step(
+        self, actions: dict[str, int]
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Play one action per player.
+
+        Raises:
+            RuntimeError: the episode is over.
+            ValueError: a player's action is missing or unknown.
+        """
+        if not self.agents:
+            raise RuntimeError("the episode is over: call reset before step")
+        if missing := [agent for agent in self.agents if agent not in actions]:
+            raise ValueError(f"actions: none given for {', '.join(missing)}")
+        joint = np.array([[int(actions[agent]) for agent in self.agents]])
+        batch = self.env.step(joint)
+        players = self.agents
+        reward = self._reward(batch)
+        terminated, truncated = bool(batch.terminated[0]), bool(batch.truncated[0])
+        self.agents = [] if terminated or truncated else list(self.possible_agents)
+        return (
+            self._observations(),
+            dict.fromkeys(players, reward),
+            dict.fromkeys(players, terminated),
+            dict.fromkeys(players, truncated),
+            self._infos(batch.events[0], float(batch.score[0])),
+        )
+
+    def state(self) -> np.ndarray:
+        """The joint observation (P, *view.shape)."""
+        return self.env.observe(self.view)[0]
+
+    def render(self) -> np.ndarray | str | None:
+        """A picture (H, W, 3) uint8 or text, as `render_mode` says; None without a render mode."""
+        if self.render_mode == "rgb_array":
+            return self.env.render_rgb(0)
+        return self.env.render_text(0) if self.render_mode == "ansi" else None
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        return dict(zip(self.possible_agents, self.state(), strict=True))
+
+    def _reward(self, batch: StepBatch) -> float:
+        if self.reward == "environment":
+            return float(batch.reward[0])
+        return float((batch.events[0] * self._weights).sum())
+
+    def _infos(self, events: np.ndarray, score: float) -> dict[str, dict[str, Any]]:
+        names = self.env.spec.event_names
+        return {
+            agent: {"events": dict(zip(names, map(int, row), strict=True)), "score": score}
+            for agent, row in zip(self.possible_agents, events, strict=True)
+        }
+
+
+def parallel_env(
+    name: str,
+    *,
+    view: str = "features",
+    reward: str = "environment",
+    render_mode: str | None = None,
+    seed: int = 0,
+    **params: Any,
+) -> PopgenParallelEnv:
+    """A registered environment as a ParallelEnv; `params` go to the environment (see `make_env`).
+
+    Raises:
+        UserError: unknown environment, parameter, view, reward or render mode.
+    """
+    return PopgenParallelEnv(make_env(name, 1, seed=seed, **params), view=view, reward=reward, render_mode=render_mode)
+
+
+def _space(view: ViewSpec, shape: tuple[int, ...]) -> spaces.Box:
+    dtype = np.dtype(view.dtype)
+    high = 1.0 if view.binary else view.scale
+    low = -high if np.issubdtype(dtype, np.floating) and not view.binary else 0.0
+    return spaces.Box(low=dtype.type(low), high=dtype.type(high), shape=shape, dtype=dtype.type)
+
+
+def _choose(field: str, value: Any, choices: tuple[Any, ...]) -> None:
+    if value not in choices:
+        raise UserError(field, f"{value!r} is unknown", f"choose one of {', '.join(map(str, choices))}")

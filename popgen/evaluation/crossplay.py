@@ -1,0 +1,240 @@
+"""The SP/XP matrix: every member with every member, in both seatings, and beside a random and an idle partner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from popgen.errors import UserError
+from popgen.evaluation.rollout import Episodes, play_teams
+from popgen.policies.base import Policy
+from popgen.policies.simple import IdlePolicy, RandomPolicy
+from popgen.population.manifest import EnvironmentInfo
+from popgen.population.store import Population
+
+RANDOM, IDLE = "random", "idle"
+PARTNERS = (RANDOM, IDLE)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean and its standard error, NaN where one sample (or none) allows no estimate."""
+
+    mean: float
+    error: float
+
+    @classmethod
+    def of(cls, samples: np.ndarray) -> Estimate:
+        """Mean of independent samples (N,); error = s / sqrt(N) with the unbiased s."""
+        count = len(samples)
+        error = float(np.std(samples, ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+        return cls(float(np.mean(samples)) if count else math.nan, error)
+
+    @classmethod
+    def average(cls, parts: Sequence[Estimate]) -> Estimate:
+        """Mean of independent estimates, with equal weights; error = sqrt(sum of squares) / N."""
+        if not parts:
+            return cls(math.nan, math.nan)
+        error = math.sqrt(sum(part.error**2 for part in parts)) / len(parts)
+        return cls(float(np.mean([part.mean for part in parts])), error)
+
+    def below(self, other: Estimate) -> bool:
+        """Lower than `other` by more than two standard errors of the difference (0 where they are unknown)."""
+        error = math.hypot(self.error, other.error)
+        return self.mean < other.mean - (2 * error if math.isfinite(error) else 0.0)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Figures per episode of one player in seat 0 and one in seat 1.
+
+    Attributes:
+        seats: label of the player in each seat: a member's number as text, `random` or `idle`.
+        scores: (N,) the episodes' scores.
+        score, reward, shaped: means over episodes; the shaped return is the sum over both seats.
+        events: (P, E) mean count of each event, per seat.
+    """
+
+    seats: tuple[str, str]
+    scores: np.ndarray
+    score: Estimate
+    reward: Estimate
+    shaped: Estimate
+    events: np.ndarray
+
+
+@dataclass(frozen=True)
+class Obstruction:
+    """An ordered pair whose cross-play is worse than a member's play beside a random or idle partner.
+
+    Attributes:
+        pair: members in seat 0 and seat 1.
+        partner: `random` or `idle`.
+        member: who of the two would do better with that partner in the other seat.
+        xp, beside: scores of the pair, and of `member` with the partner.
+    """
+
+    pair: tuple[int, int]
+    partner: str
+    member: int
+    xp: Estimate
+    beside: Estimate
+
+
+@dataclass(frozen=True)
+class CrossPlayResult:
+    """All pairings of M members and the figures drawn from them.
+
+    Attributes:
+        environment, method: as in the manifest.
+        event_names, event_weights: of the E events.
+        members: ids, in the order of rows and columns.
+        episodes: per ordered pair.
+        seed: of the evaluation.
+        steps: environment steps taken, kind `evaluation`.
+        pairings: by label of seat 0 and seat 1.
+    """
+
+    environment: EnvironmentInfo
+    method: str
+    event_names: tuple[str, ...]
+    event_weights: tuple[float, ...]
+    members: tuple[int, ...]
+    episodes: int
+    seed: int
+    steps: int
+    pairings: dict[tuple[str, str], Pairing]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Members as text."""
+        return tuple(str(member) for member in self.members)
+
+    def score(self, seat_0: int | str, seat_1: int | str) -> Estimate:
+        """Score of an ordered pair; NaN if it was not played."""
+        pairing = self.pairings.get((str(seat_0), str(seat_1)))
+        return pairing.score if pairing else Estimate(math.nan, math.nan)
+
+    def table(self, labels: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Means and standard errors (K, K): row = seat 0, column = seat 1; NaN where not played."""
+        cells = [[self.score(row, column) for column in labels] for row in labels]
+        return (
+            np.array([[cell.mean for cell in row] for row in cells]).reshape(len(labels), len(labels)),
+            np.array([[cell.error for cell in row] for row in cells]).reshape(len(labels), len(labels)),
+        )
+
+    @property
+    def sp(self) -> Estimate:
+        """Mean self-play score over members."""
+        return Estimate.average([self.score(m, m) for m in self.members])
+
+    @property
+    def xp(self) -> Estimate:
+        """Mean cross-play score over ordered pairs of different members; NaN for one member."""
+        return Estimate.average([self.score(i, j) for i in self.members for j in self.members if i != j])
+
+    def beside(self, partner: str, seat: int | None = None) -> Estimate:
+        """Mean score of the members beside a `random` or `idle` partner sitting in `seat`, None for both."""
+        parts = [self.score(m, partner) for m in self.members] if seat in (1, None) else []
+        parts += [self.score(partner, m) for m in self.members] if seat in (0, None) else []
+        return Estimate.average(parts)
+
+    @property
+    def obstructions(self) -> tuple[Obstruction, ...]:
+        """Where cross-play is so low that a player must be in the other's way.
+
+        Members (i, j) in seats 0 and 1 are compared with i beside the random or idle player in seat 1 and with j
+        beside it in seat 0. Worse than these by more than two standard errors is sabotage, not another convention.
+        """
+        found = []
+        for i in self.members:
+            for j in self.members:
+                for partner in PARTNERS if i != j else ():
+                    for member, beside in ((i, self.score(i, partner)), (j, self.score(partner, j))):
+                        if self.score(i, j).below(beside):
+                            found.append(Obstruction((i, j), partner, member, self.score(i, j), beside))
+        return tuple(found)
+
+    @property
+    def obstruction(self) -> dict[str, bool]:
+        """Partner -> mean XP is below the members' mean beside it, by more than two standard errors."""
+        return {partner: self.xp.below(self.beside(partner)) for partner in PARTNERS}
+
+
+def evaluate_population(
+    population: Population,
+    episodes: int,
+    seed: int,
+    members: Sequence[int] | None = None,
+    *,
+    max_envs: int = 1024,
+    progress: Callable[[int, int], None] | None = None,
+) -> CrossPlayResult:
+    """Play all ordered pairs of members, and each member beside a random and an idle partner in both seats.
+
+    Args:
+        population: of at least one member.
+        episodes: per ordered pair.
+        seed: same arguments, same result.
+        members: ids to evaluate, None for all.
+        max_envs: largest batch.
+        progress: called with (episodes done, episodes in all).
+
+    Raises:
+        UserError: no members, an unknown or repeated one, or less than 1 episode.
+    """
+    chosen = _chosen(population, members)
+    if episodes < 1:
+        raise UserError("evaluation.episodes", f"must be at least 1, got {episodes}")
+    spec = population.spec
+    labels = [str(member) for member in chosen] + list(PARTNERS)
+    policies: list[Policy] = [population[member] for member in chosen]
+    policies += [RandomPolicy(spec.num_actions), IdlePolicy(spec.action_names)]
+    count = len(chosen)
+    # All pairs but those of the two partners among themselves.
+    teams = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
+    played = play_teams(
+        population.make_env, policies, teams, episodes, seed=seed, max_envs=max_envs, progress=progress
+    )
+    pairings = {}
+    for n, (i, j) in enumerate(teams):
+        rows = slice(n * episodes, (n + 1) * episodes)
+        pairings[labels[i], labels[j]] = _pairing((labels[i], labels[j]), played, rows)
+    return CrossPlayResult(
+        environment=population.env_info,
+        method=population.manifest.method,
+        event_names=tuple(spec.event_names),
+        event_weights=tuple(float(weight) for weight in spec.event_weights),
+        members=chosen,
+        episodes=episodes,
+        seed=seed,
+        steps=played.steps,
+        pairings=pairings,
+    )
+
+
+def _chosen(population: Population, members: Sequence[int] | None) -> tuple[int, ...]:
+    if not len(population):
+        raise UserError(str(population.path), "has no members yet", "train at least one first")
+    chosen = tuple(range(1, len(population) + 1)) if members is None else tuple(int(member) for member in members)
+    for member in chosen:
+        if not 1 <= member <= len(population):
+            raise UserError("members", f"no member {member}", f"choose among 1 to {len(population)}")
+    if not chosen or len(set(chosen)) != len(chosen):
+        raise UserError("members", "must be one or more different numbers", f"choose among 1 to {len(population)}")
+    return chosen
+
+
+def _pairing(seats: tuple[str, str], played: Episodes, rows: slice) -> Pairing:
+    scores = played.score[rows]
+    return Pairing(
+        seats=seats,
+        scores=scores,
+        score=Estimate.of(scores),
+        reward=Estimate.of(played.reward[rows]),
+        shaped=Estimate.of(played.shaped[rows].sum(-1)),
+        events=played.events[rows].mean(0),
+    )

@@ -1,0 +1,101 @@
+"""Building blocks: multi-layer perceptrons, the layer-normalised GRU cell, convolutional encoder and decoder."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"silu": nn.SiLU, "leaky_relu": nn.LeakyReLU}
+
+
+def linear(inputs: int, outputs: int, *, scale: float = 1.0) -> nn.Linear:
+    """Linear layer with truncated-normal weights of variance scale / fan-average and zero bias (DreamerV3)."""
+    layer = nn.Linear(inputs, outputs)
+    if scale == 0.0:
+        nn.init.zeros_(layer.weight)
+    else:
+        deviation = math.sqrt(2.0 * scale / (inputs + outputs))
+        nn.init.trunc_normal_(layer.weight, std=deviation, a=-2 * deviation, b=2 * deviation)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def mlp(
+    inputs: int,
+    outputs: int | None,
+    *,
+    units: int,
+    layers: int,
+    activation: str,
+    norm: bool,
+    output_scale: float = 1.0,
+) -> nn.Sequential:
+    """`layers` hidden layers of `units`, each Linear (+ LayerNorm) + activation, then a linear output if asked."""
+    parts: list[nn.Module] = []
+    for index in range(layers):
+        parts.append(linear(inputs if index == 0 else units, units))
+        if norm:
+            parts.append(nn.LayerNorm(units, eps=1e-3))
+        parts.append(ACTIVATIONS[activation]())
+    if outputs is not None:
+        parts.append(linear(units if layers else inputs, outputs, scale=output_scale))
+    return nn.Sequential(*parts)
+
+
+class NormGRUCell(nn.Module):
+    """GRU cell with one layer norm over its three gates (DreamerV2/V3); starts out slow to forget."""
+
+    def __init__(self, inputs: int, units: int) -> None:
+        super().__init__()
+        self.units = units
+        self.gates = linear(inputs + units, 3 * units)
+        self.norm = nn.LayerNorm(3 * units, eps=1e-3)
+
+    def forward(self, inputs: Tensor, hidden: Tensor) -> Tensor:
+        """inputs (B, I), hidden (B, D) -> (B, D)."""
+        reset, candidate, update = self.norm(self.gates(torch.cat([inputs, hidden], -1))).chunk(3, -1)
+        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+        update = torch.sigmoid(update - 1.0)
+        return hidden + update * (candidate - hidden)
+
+
+class ConvEncoder(nn.Module):
+    """Same-padded convolutions over a grid view, then flat. (B, W, H, K) -> (B, features)."""
+
+    def __init__(self, shape: Sequence[int], *, channels: int, kernels: Sequence[int], activation: str) -> None:
+        super().__init__()
+        width, height, planes = shape
+        parts: list[nn.Module] = []
+        for kernel in kernels:
+            parts += [nn.Conv2d(planes, channels, kernel, padding=kernel // 2), ACTIVATIONS[activation]()]
+            planes = channels
+        self.layers = nn.Sequential(*parts)
+        self.features = channels * width * height
+
+    def forward(self, grid: Tensor) -> Tensor:
+        return self.layers(grid.permute(0, 3, 1, 2)).flatten(1)
+
+
+class ConvDecoder(nn.Module):
+    """Transposed convolutions back to a grid view. (B, inputs) -> (B, W, H, K)."""
+
+    def __init__(
+        self, inputs: int, shape: Sequence[int], *, channels: int, kernels: Sequence[int], activation: str
+    ) -> None:
+        super().__init__()
+        self.width, self.height, planes = shape
+        self.channels = channels
+        self.expand = linear(inputs, channels * self.width * self.height)
+        parts: list[nn.Module] = []
+        for index, kernel in enumerate(reversed(kernels)):
+            last = index == len(kernels) - 1
+            parts.append(ACTIVATIONS[activation]())
+            parts.append(nn.ConvTranspose2d(channels, planes if last else channels, kernel, padding=kernel // 2))
+        self.layers = nn.Sequential(*parts)
+
+    def forward(self, features: Tensor) -> Tensor:
+        grid = self.expand(features).unflatten(-1, (self.channels, self.width, self.height))
+        return self.layers(grid).permute(0, 2, 3, 1)

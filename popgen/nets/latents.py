@@ -1,0 +1,61 @@
+"""Grouped categorical latents, stored class-major: (..., C, G).
+
+Softmax and sampling over a last dimension of eight classes waste the vector units of a CPU; with the classes
+second to last, every operation runs over the G groups contiguously (about ten times faster).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def probabilities(logits: Tensor, unimix: float) -> Tensor:
+    """Softmax over the classes, mixed with a uniform share (DreamerV3). logits (..., C, G) -> same."""
+    probs = torch.softmax(logits, dim=-2)
+    return probs * (1.0 - unimix) + unimix / logits.shape[-2]
+
+
+def sample_one_hot(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """One-hot samples (..., C, G) by inverting the cumulative distribution; no gradient."""
+    cumulative = probs.detach().float().cumsum(dim=-2)
+    total = cumulative[..., -1:, :]
+    uniform = torch.rand(total.shape, generator=generator, device=probs.device)
+    passed = (cumulative >= uniform * total).to(probs.dtype)
+    one_hot = passed.clone()
+    one_hot[..., 1:, :] -= passed[..., :-1, :]
+    return one_hot
+
+
+def straight_through(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """One-hot samples whose gradient is that of the probabilities."""
+    return sample_one_hot(probs, generator) + probs - probs.detach()
+
+
+def kl_divergence(p: Tensor, q: Tensor) -> Tensor:
+    """KL[p || q] summed over groups; probabilities (..., C, G) -> (...)."""
+    return (p * (p.log() - q.log())).sum(dim=(-2, -1))
+
+
+def player_masks(groups: int, joint_groups: int, classes: int) -> Tensor:
+    """(P, C * G) masks that keep the joint groups and player p's own (paper: z^i = (z^joint, z^{p_i})).
+
+    The first `joint_groups` groups are joint, the rest is halved between the two players.
+    """
+    private = (groups - joint_groups) // 2
+    mask = torch.zeros(2, groups)
+    mask[:, :joint_groups] = 1.0
+    mask[0, joint_groups : joint_groups + private] = 1.0
+    mask[1, joint_groups + private :] = 1.0
+    return mask[:, None, :].expand(2, classes, groups).reshape(2, classes * groups).contiguous()
+
+
+def to_indices(one_hot: Tensor) -> Tensor:
+    """(..., C, G) one-hot -> (..., G) uint8 class indices, 1 / C of the memory."""
+    return one_hot.argmax(dim=-2).to(torch.uint8)
+
+
+def from_indices(indices: Tensor, classes: int) -> Tensor:
+    """(..., G) class indices -> (..., C, G) float one-hot."""
+    grid = torch.arange(classes, device=indices.device).unsqueeze(-1)
+    return (indices.unsqueeze(-2) == grid).float()

@@ -1,0 +1,45 @@
+"""Registry of policy kinds: what a saved policy's `kind` stands for, imported when first needed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from popgen.envs.base import EnvSpec
+from popgen.policies.base import Policy
+
+POLICIES: dict[str, str] = {
+    "world_model": "popgen.policies.world_model_policy:WorldModelPolicy",
+    "random": "popgen.policies.simple:RandomPolicy",
+    "idle": "popgen.policies.simple:IdlePolicy",
+    "feed_forward": "popgen.policies.simple:FeedForwardPolicy",
+}
+"""kind -> `module:class`; the only classes that a loaded artefact can name."""
+
+
+def policy_class(kind: str) -> type[Policy]:
+    """The class behind a kind.
+
+    Raises:
+        ValueError: the kind is not registered.
+    """
+    if kind not in POLICIES:
+        raise ValueError(f"unknown policy kind {kind!r}, known are {', '.join(sorted(POLICIES))}")
+    module, _, name = POLICIES[kind].partition(":")
+    return getattr(import_module(module), name)
+
+
+def build_policy(kind: str, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> Policy:
+    """Build a policy of a registered kind from its parts.
+
+    Raises:
+        ValueError: unknown kind, or parts that do not fit each other or the environment.
+    """
+    cls = policy_class(kind)
+    try:
+        return cls.from_parts(config, weights, spec)
+    except (KeyError, TypeError, RuntimeError) as error:  # what torch and constructors raise for ill-fitting parts
+        raise ValueError(f"{kind} policy cannot be built: {error}") from error

@@ -1,0 +1,78 @@
+"""A member of an XPM-WM population: its own archived latent filter and its actor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from popgen.config import AgentConfig, WorldModelConfig
+from popgen.envs.base import EnvSpec
+from popgen.nets import weights as w
+from popgen.nets.actor_critic import Actor
+from popgen.world_model.model import Latent, LatentFilter
+
+
+class WorldModelPolicy:
+    """Filters the joint observation into (h, z) and acts on each seat's player-specific latent.
+
+    Actions are sampled from the actor, as in training.
+    """
+
+    kind: ClassVar[str] = "world_model"
+
+    def __init__(self, model: WorldModelConfig, agent: AgentConfig, spec: EnvSpec) -> None:
+        self._model, self._agent, self._spec = model, agent, spec
+        self.view = model.view
+        self.filter = LatentFilter(model, spec).eval().requires_grad_(False)
+        self.actor = Actor(agent, model, spec.num_actions).eval().requires_grad_(False)
+        self._generator = torch.Generator()
+        self._latent: Latent | None = None
+
+    def reset(self, batch: int, seed: int) -> None:
+        """B fresh episodes; see `Policy`."""
+        self._generator.manual_seed(seed)
+        self._latent = self.filter.initial(batch)
+
+    def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+        """(B, P) uint8 actions; see `Policy`."""
+        if self._latent is None or len(is_first) != len(self._latent.h):
+            raise RuntimeError(f"reset(batch={len(is_first)}, seed) before act on {len(is_first)} rows")
+        with torch.no_grad():
+            self._latent = self.filter.filter(
+                self._latent,
+                torch.from_numpy(np.ascontiguousarray(obs)),
+                torch.from_numpy(previous_actions.astype(np.int64)),
+                torch.from_numpy(np.ascontiguousarray(is_first)),
+                self._generator,
+            )
+            pair = Latent(*(x.unsqueeze(1).expand(-1, 2, -1) for x in (self._latent.h, self._latent.z)))
+            seats = torch.tensor([0, 1]).expand(len(is_first), 2)
+            return self.actor.sample(pair, seats, self._generator).numpy().astype(np.uint8)
+
+    def config(self) -> dict[str, Any]:
+        """The two schemas the networks are built from."""
+        return {"world_model": self._model.model_dump(mode="json"), "agent": self._agent.model_dump(mode="json")}
+
+    def weights(self) -> w.Weights:
+        """`filter.*` and `actor.*`."""
+        return w.prefixed("filter", w.weights_of(self.filter)) | w.prefixed("actor", w.weights_of(self.actor))
+
+    def load(self, weights: w.Weights) -> None:
+        """Take over `weights()` of a policy of the same sizes; the running episodes' latents stay."""
+        w.load_weights(self.filter, w.under("filter", weights))
+        w.load_weights(self.actor, w.under("actor", weights))
+
+    @classmethod
+    def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> WorldModelPolicy:
+        """Build from `config()` and `weights()`; raises ValueError if they do not fit."""
+        policy = cls(
+            WorldModelConfig.model_validate(config["world_model"]), AgentConfig.model_validate(config["agent"]), spec
+        )
+        try:
+            policy.load(dict(weights))
+        except RuntimeError as error:
+            raise ValueError(" ".join(str(error).split())) from None
+        return policy

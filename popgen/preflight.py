@@ -1,0 +1,142 @@
+"""What must hold before anything starts: checked in a second or two, without Ray, torch or MLflow."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from popgen.config import RunConfig
+from popgen.envs.base import EnvSpec
+from popgen.envs.registry import make_env
+from popgen.errors import UserError
+from popgen.tracking import check_uri
+
+MARGIN = 256 * 2**20
+"""Bytes of disk beside buffers and weights: MLflow's file, logs, plots."""
+
+_RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def preflight(config: RunConfig) -> None:
+    """Refuse a run that cannot go well.
+
+    Raises:
+        UserError: an environment that cannot be built, a view it does not have, a population to start from that is not
+            of this environment, an unsafe run id, a root that cannot be written, or too little disk or memory.
+    """
+    spec = _build(config)
+    _check_view(config, spec)
+    check_run_id(config.run.id)
+    _check_lengths(config, spec)
+    if config.tracking.enabled:
+        check_uri(config.tracking.uri)
+    if config.population.init_from is not None:
+        _check_start(config, spec)
+    check_memory(config, spec)
+    check_root(Path(config.run.root), disk_bytes(config, spec))
+
+
+def check_run_id(name: str | None) -> None:
+    """A run's id is a folder's name: letters, digits, dot, dash and underscore."""
+    if name is not None and not _RUN_ID.fullmatch(name):
+        problem = f"{name!r} is no safe folder name"
+        raise UserError(
+            "run.id", problem, "use up to 100 letters, digits, '.', '-' and '_', beginning with a letter or digit"
+        )
+
+
+def buffer_bytes(config: RunConfig, spec: EnvSpec) -> int:
+    """Estimated bytes of the two full replay buffers.
+
+    A step is kept as two states (before and after it) in the environment's dtype, the actions and events of the P
+    players, and some 16 bytes of flags, reward and episode position.
+    """
+    state = spec.state_size * np.dtype(spec.state_dtype).itemsize
+    step = 2 * state + spec.num_players * (1 + spec.num_events) + 16
+    return 2 * config.replay.capacity * step
+
+
+def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
+    """Estimated bytes of the run's folder: two checkpoints at a time (old and new), each with both buffers."""
+    return 2 * buffer_bytes(config, spec) + MARGIN
+
+
+def check_memory(config: RunConfig, spec: EnvSpec) -> None:
+    """Both buffers must fit into this machine's memory; a cluster's nodes are not looked at."""
+    if config.cluster.address is not None:
+        return
+    needed, have = buffer_bytes(config, spec), memory_bytes()
+    if needed > have:
+        problem = f"{config.replay.capacity:,} steps need about {_gib(needed)}, this machine has {_gib(have)}"
+        raise UserError("replay.capacity", problem, "lower it")
+
+
+def check_root(root: Path, needed: int, field: str = "run.root") -> None:
+    """A folder to write to must be (or become) a writable folder with room for `needed` bytes."""
+    fix = "choose another folder"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=root, prefix=".popgen-"):
+            pass
+        free = shutil.disk_usage(root).free
+    except OSError as error:
+        raise UserError(field, f"cannot write to {root} ({error.strerror or error})", fix) from None
+    if free < needed:
+        problem = f"{root} has {_gib(free)} free, {_gib(needed)} may be needed"
+        raise UserError(field, problem, "free some space or choose another folder")
+
+
+def memory_bytes() -> int:
+    """Physical memory of this machine."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _build(config: RunConfig) -> EnvSpec:
+    try:
+        return make_env(config.env.name, 1, seed=config.run.seed, **config.env.params).spec
+    except UserError as error:
+        name = error.field.removeprefix("env.")
+        field = f"env.params.{name}" if name in config.env.params else "env.name" if name == "layout" else error.field
+        raise UserError(field, error.problem, error.fix) from None
+
+
+def _check_view(config: RunConfig, spec: EnvSpec) -> None:
+    view = config.world_model.view
+    if view not in spec.views:
+        raise UserError(
+            "world_model.view", f"{spec.name} has no view {view!r}", f"choose one of {', '.join(spec.views)}"
+        )
+
+
+def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
+    if config.world_model.length > spec.horizon:
+        problem = (
+            f"windows of {config.world_model.length} steps are longer than an episode of {spec.name} ({spec.horizon})"
+        )
+        raise UserError("world_model.length", problem, "shorten them")
+
+
+def _check_start(config: RunConfig, spec: EnvSpec) -> None:
+    from popgen.population import check_compatible, load_population
+
+    path = str(config.population.init_from)
+    try:
+        population = load_population(path)
+    except UserError as error:
+        raise UserError("population.init_from", f"{error.field} {error.problem}", error.fix) from None
+    check_compatible(population, spec)
+    wanted = config.population.init_members
+    if wanted > len(population):
+        raise UserError("population.init_members", f"{wanted}, but {path} has {len(population)}", "lower it")
+    if wanted >= config.population.size:
+        problem = f"{config.population.size} leaves nothing to train after {wanted} members from {path}"
+        raise UserError("population.size", problem, "raise it above population.init_members")
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"

@@ -1,0 +1,102 @@
+"""Frozen records that pass between the rooms of popgen (see shapes.py for the dimensions)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+
+class Kind(StrEnum):
+    """What an environment step was spent on; each has its own column in the ledger."""
+
+    RANDOM = "random"
+    SP = "SP"
+    XP = "XP"
+    MP = "MP"
+    EVALUATION = "evaluation"
+    SIMULATED = "simulated"  # steps of an exact simulator used as the dynamics model F
+
+
+RANDOM_MEMBER = 0
+"""Member id of the uniform-random player; trained members count from 1."""
+
+
+@dataclass(frozen=True)
+class StepBatch:
+    """What one joint step of B environments gave.
+
+    Attributes:
+        reward: (B,) float32, the environment's own joint reward, counted once for the team.
+        score: (B,) float32, the headline figure: dishes in Overcooked, the reward in rendezvous.
+        events: (B, P, E) uint8, which player caused which event.
+        terminated: (B,) bool, the task itself ended.
+        truncated: (B,) bool, the horizon was reached; bootstrap, do not treat as terminal.
+    """
+
+    reward: np.ndarray
+    score: np.ndarray
+    events: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+
+    @property
+    def done(self) -> np.ndarray:
+        """(B,) bool: the environment must be reset before its next step."""
+        return self.terminated | self.truncated
+
+
+@dataclass(frozen=True)
+class Segment:
+    """T contiguous steps of B environments played by one pair of members.
+
+    Row t holds the transition s_t, a_t -> s_{t+1}; `next_states[t]` is s_{t+1} even where the
+    environment was reset before row t + 1.
+
+    Attributes:
+        kind: random, SP, XP, ...
+        members: who sat in seat 0 and seat 1 (RANDOM_MEMBER for the random player).
+        states, next_states: (T, B, S) in the environment's state dtype.
+        actions: (T, B, P) uint8.
+        reward, score: (T, B) float32.
+        events: (T, B, P, E) uint8, caused by the transition of the row.
+        terminated, truncated: (T, B) bool.
+        sampler, sequence: who stepped it and its running number, the ledger's key.
+    """
+
+    kind: Kind
+    members: tuple[int, int]
+    states: np.ndarray
+    next_states: np.ndarray
+    actions: np.ndarray
+    reward: np.ndarray
+    score: np.ndarray
+    events: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    sampler: str
+    sequence: int
+
+    @property
+    def steps(self) -> int:
+        """Environment steps in the segment: T * B."""
+        return int(self.reward.size)
+
+
+@dataclass(frozen=True)
+class LedgerEntry:
+    """Environment steps of one task; the key (run, member, kind, sampler, sequence) is unique."""
+
+    run: str
+    member: int
+    kind: Kind
+    sampler: str
+    sequence: int
+    steps: int
+    episodes: int
+    score: float
+
+    @property
+    def key(self) -> tuple[str, int, str, str, int]:
+        return (self.run, self.member, str(self.kind), self.sampler, self.sequence)

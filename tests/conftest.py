@@ -1,0 +1,33 @@
+"""Shared by all tests: a quiet, offline, single-threaded process, and a small population on disk."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+for _name, _value in {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "OMP_NUM_THREADS": "1",
+    "MPLBACKEND": "Agg",
+}.items():
+    os.environ.setdefault(_name, _value)
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def random_population(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two uniformly random members for cramped_room with automatic cooking and episodes of 20 steps."""
+    from popgen.envs import make_env
+    from popgen.policies.simple import RandomPolicy
+    from popgen.population import PopulationWriter
+
+    path = tmp_path_factory.mktemp("population") / "two_random"
+    spec = make_env("overcooked/cramped_room", 1, cooking="auto", events="dispenser", horizon=20).spec
+    writer = PopulationWriter(path, spec, method="xpm_wm", config_digest="0" * 64, seed=0)
+    for member in (1, 2):
+        writer.add_member(RandomPolicy(spec.num_actions), seed=member, steps={"SP": 100 * member, "XP": 10})
+    return path

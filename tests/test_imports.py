@@ -1,0 +1,118 @@
+"""The direction of imports and the size of functions, read from the source."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+# A room may import the rooms above it in this list, never one below.
+ORDER = (
+    *("types", "shapes", "errors", "progress", "config"),
+    *("envs", "nets", "losses"),
+    *("tracking", "world_model", "policies", "data"),
+    "population",
+    *("algos", "rllib", "evaluation"),
+    "preflight",
+    "actors",
+    "pipelines",
+    *("conf", "cli", "__main__"),
+)
+FORBIDDEN = {("algos", "rllib"), ("rllib", "algos")}  # whatever their place in the list
+OWNERS = {  # outside package -> where it may be imported
+    "ray": ("actors", "pipelines", "rllib"),
+    "hydra": ("cli",),
+    "omegaconf": ("cli",),
+    "mlflow": ("tracking",),
+}
+TOP = ("popgen", "actors", "pipelines", "conf")
+LONGEST = 60
+
+
+def sources(*folders: str) -> list[Path]:
+    found = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
+    assert found
+    return found
+
+
+def room(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return parts[1] if parts[0] == "popgen" else parts[0]
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """(line, dotted module) of every import, also inside functions; `from a import b` gives a and a.b."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = path.relative_to(ROOT).parts[: -node.level]
+                base = ".".join([*package, *([base] if base else [])])
+            yield node.lineno, base
+            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+
+
+def target_room(module: str) -> str | None:
+    """The room of an imported module; None for packages of others and for `popgen` itself."""
+    first, *rest = module.split(".")
+    if first == "popgen":
+        is_room = bool(rest) and ((ROOT / "popgen" / rest[0]).is_dir() or (ROOT / "popgen" / f"{rest[0]}.py").is_file())
+        return rest[0] if is_room else None
+    return first if first in TOP else None
+
+
+def test_every_room_has_a_place() -> None:
+    rooms = {room(path) for path in sources(*TOP)} - {"__init__"}
+    assert rooms <= set(ORDER), f"give {sorted(rooms - set(ORDER))} a place in ORDER"
+
+
+def test_imports_go_one_way() -> None:
+    wrong = []
+    for path in sources(*TOP):
+        here = room(path)
+        for line, module in imports(path):
+            there = target_room(module)
+            if there is None or there == here:
+                continue
+            upward = here == "__init__" or ORDER.index(there) > ORDER.index(here)
+            if upward or (here, there) in FORBIDDEN:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} {here} imports {there}")
+    assert not wrong, "\n".join(sorted(set(wrong)))
+
+
+@pytest.mark.parametrize("package", OWNERS)
+def test_heavy_packages_stay_in_their_rooms(package: str) -> None:
+    users = {room(path) for path in sources(*TOP) for _, module in imports(path) if module.partition(".")[0] == package}
+    assert users <= set(OWNERS[package])
+
+
+def test_the_reader_of_imports_sees_every_form(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "ROOT", tmp_path)
+    path = tmp_path / "popgen" / "envs" / "x.py"
+    path.parent.mkdir(parents=True)
+    path.write_text(
+        "import a.b\ndef f():\n    from popgen import algos\n    from ..nets import c\n    from . import d\n"
+    )
+    (tmp_path / "popgen" / "algos").mkdir()
+    (tmp_path / "popgen" / "nets").mkdir()
+    found = {module for _, module in imports(path)}
+    assert {"a.b", "popgen.algos", "popgen.nets", "popgen.nets.c", "popgen.envs.d"} <= found
+    assert {target_room(module) for module in found} == {None, "algos", "nets", "envs"}
+
+
+def test_functions_are_short() -> None:
+    long = []
+    for path in sources(*TOP, "tests"):
+        lines = path.read_text().splitlines()
+        for node in ast.walk(ast.parse("\n".join(lines))):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            length = (node.end_lineno or node.lineno) - node.lineno + 1
+            if length > LONGEST and "# long: " not in lines[node.lineno - 1]:
+                long.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name} has {length} lines")
+    assert not long, "\n".join(long)
