@@ -10,7 +10,7 @@ import numpy as np
 import ray
 
 from actors.common import build_env, settle
-from popgen.algos.xpm_wm.diagnostics import model_report
+from popgen.algos.xpm_wm.diagnostics import OPEN_LOOP, model_report
 from popgen.algos.xpm_wm.model_learner import ModelLearner
 from popgen.algos.xpm_wm.recipe import Draws, model_batch, start_batch
 from popgen.algos.xpm_wm.starts import OLD, Starts
@@ -95,7 +95,7 @@ class ModelActor:
     def report(self) -> dict[str, float]:
         """Event precision and recall at one step and open loop, exact observations: on fresh windows."""
         length = self.config.world_model.length
-        parts = self._draw(model_batch(self.config, self.member), 2 * length, 4)
+        parts = self._draw(model_batch(self.config, self.member), length + OPEN_LOOP, 4)
         windows = join([part for update in parts for part in update if part is not None])
         return model_report(self.learner, windows, context=length)
 

@@ -31,7 +31,7 @@ class Books:
     def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
         self.config, self.spec = config, spec
         stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
-        variant = config.env.name.partition("/")[2]
+        variant = Path(config.env.name).stem
         self.run_id = config.run.id or f"{config.method}-{variant}-s{config.run.seed}-{stamp}"
         self.dir = Path(config.run.root) / self.run_id
         self.dir.mkdir(parents=True, exist_ok=True)

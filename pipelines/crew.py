@@ -25,7 +25,8 @@ def start_ray(cluster: ClusterConfig) -> bool:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     local = cluster.address is None
     ray.init(
-        address=cluster.address,
+        # Without an address Ray would look for a running cluster before it starts a local one.
+        address="local" if local else cluster.address,
         num_cpus=cluster.num_cpus if local else None,
         include_dashboard=False if local else None,
         log_to_driver=False,

@@ -92,13 +92,14 @@ class Driver:
 
     def run(self) -> None:
         """Train every member that is not there yet."""
-        first = self._resume()
-        for member in range(first, self.config.population.size + 1):
-            began, self.steps = time.time(), 0
-            seed = self.config.run.seed * 1000 + member
-            snapshot = self.train_first(seed) if member == 1 else self.train_later(member, seed)
-            self._complete(member, seed, snapshot, time.time() - began)
-        self.crew.dismiss()
+        try:
+            for member in range(self._resume(), self.config.population.size + 1):
+                began, self.steps = time.time(), 0
+                seed = self.config.run.seed * 1000 + member
+                snapshot = self.train_first(seed) if member == 1 else self.train_later(member, seed)
+                self._complete(member, seed, snapshot, time.time() - began)
+        finally:
+            self.crew.dismiss()
 
     def _complete(self, member: int, seed: int, snapshot: Snapshot, seconds: float) -> None:
         """Add the member to the population, keep the buffers and the model, enter it in the books."""
@@ -188,20 +189,29 @@ class Driver:
         partners = {k: under("actor", weights) for k, weights in self.members.items()}
         filters = {k: under("filter", weights) for k, weights in self.members.items()}
         ray.get([crew.agent.begin_member.remote(member, seed, partners), crew.model.begin_member.remote(member, filters)])
-        total = phase.first_updates + (phase.rounds - 1) * phase.updates_per_round
+        rounds = self._rounds()
+        total = phase.first_updates + (rounds - 1) * phase.updates_per_round
         self.reporter.phase(f"member {member}: imagined self-play and cross-play", total)
         acting = self._imagine(member, phase.first_updates, 0, 0.0, {})
-        snapshots: list[Snapshot] = []
-        for number in range(1, phase.rounds + 1):
+        best: Snapshot | None = None
+        for number in range(1, rounds + 1):
             episodes = self._real_episodes(member, acting, seed * 100 + number)
             snapshot, scores = self._judge(member, acting, episodes, number)
-            snapshots.append(snapshot)
-            if number < phase.rounds:
+            if best is None or snapshot.merit > best.merit:
+                best = snapshot
+            if number < rounds:
                 *_, info = crew.model.train.options(num_returns=3).remote(phase.model_updates, 0)
                 self.books.log(member, self.steps, **{f"model/{k}": v for k, v in ray.get(info).items()})
                 done = phase.first_updates + (number - 1) * phase.updates_per_round
                 acting = self._imagine(member, phase.updates_per_round, done, phase.starts_new, scores)
-        return max(snapshots, key=lambda snapshot: snapshot.merit)
+        assert best is not None
+        return best
+
+    def _rounds(self) -> int:
+        """Rounds of real episodes of a later member: those configured, fewer where its environment steps end first."""
+        phase = self.config.phase2
+        each = (phase.episodes_sp + phase.episodes_xp) * self.spec.horizon
+        return phase.rounds if phase.max_steps is None else max(1, min(phase.rounds, phase.max_steps // each))
 
     def _imagine(self, member: int, updates: int, done: int, new_share: float, scores: dict[int, float]) -> Weights:
         """Refresh the start cache, then learn in imagination; the acting weights."""
@@ -275,11 +285,11 @@ class Driver:
 
     def _resume(self) -> int:
         """Take over finished members of this run, or of the run this one continues; the next member to train."""
-        present = len(self.books.population)
-        if present:
+        present, origin = len(self.books.population), self.config.population
+        if origin.init_from and present <= origin.init_members:
+            root, known = Path(origin.init_from), origin.init_members
+        elif present:
             root, known = self.books.dir, present
-        elif self.config.population.init_from:
-            root, known = Path(self.config.population.init_from), self.config.population.init_members
         else:
             return 1
         source = load_population(root / "population")
@@ -288,7 +298,7 @@ class Driver:
         ray.get([getattr(crew, name).load_state.remote(part) for name, part in state.items()])
         for member in range(1, known + 1):
             self.members[member] = source[member].weights()
-            if not present:
+            if member > present:
                 self.books.adopt(source[member], source.info(member), source.training(member))
         self.reporter.note(f"going on after member {known} of {root}")
         return known + 1

@@ -73,6 +73,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.dry_run:
         return _print_config(config.model_dump(mode="json"), args.json)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _bound_threads(config.cluster.threads)
     from pipelines.population import run_population
 
     reporter = make_reporter(quiet=args.quiet)
@@ -85,6 +86,12 @@ def _run(args: argparse.Namespace) -> int:
     else:
         _print_run(result)
     return OK
+
+
+def _bound_threads(count: int) -> None:
+    """Before torch is imported: its threads wait for each other actively, which on busy cores costs many times more
+    than one thread alone takes for the small networks of an acting policy."""
+    os.environ.setdefault("OMP_NUM_THREADS", str(count))
 
 
 def _print_config(values: dict[str, Any], as_json: bool) -> int:
@@ -117,20 +124,30 @@ def _plain(value: Any) -> Any:
 def _print_run(result: Mapping[str, Any]) -> None:
     from rich.table import Table
 
-    means = result["matrix"]["mean"]
-    table = Table("seat 0 \\ seat 1", *(str(member + 1) for member in range(len(means))), title="SP/XP")
-    for member, row in enumerate(means, start=1):
-        table.add_row(str(member), *("-" if cell is None else f"{cell:.2f}" for cell in row))
+    evaluation = result["evaluation"]
+    members, matrix = evaluation["members"], evaluation["matrix"]
+    title = f"{evaluation['environment']['name']}: {evaluation['unit']} per episode (± standard error)"
+    table = Table("seat 0 \\ seat 1", *map(str, members), title=title)
+    for member, means, errors in zip(members, matrix["mean"], matrix["standard_error"], strict=True):
+        cells = ({"mean": mean, "standard_error": error} for mean, error in zip(means, errors, strict=True))
+        table.add_row(str(member), *map(_figure_text, cells))
     _print_table(table)
-    counted = ", ".join(
-        f"{'all' if member == 'total' else f'member {member}'} {row['total']:,}"
-        for member, row in result["ledger"].items()
-    )
-    print(f"environment steps: {counted}")
+    print(f"SP mean {_figure_text(evaluation['sp'])}   XP mean {_figure_text(evaluation['xp'])}")
+    rows = result["ledger"].items()
+    steps = ", ".join(f"{'all' if who == 'total' else f'member {who}'} {row['total']:,}" for who, row in rows)
+    print(f"environment steps: {steps}   time: {result['seconds'] / 60:.1f} minutes")
     print(f"population: {result['population']}   ledger, checkpoints and reports: {result['run_dir']}")
 
 
+def _figure_text(figure: Mapping[str, float | None]) -> str:
+    mean, error = figure["mean"], figure["standard_error"]
+    if mean is None:
+        return "-"
+    return f"{mean:.2f}" if error is None else f"{mean:.2f} ± {error:.2f}"
+
+
 def _evaluate(args: argparse.Namespace) -> int:
+    _bound_threads(1)
     from popgen.population import check_compatible, load_population
     from popgen.preflight import check_root
     from popgen.progress import make_reporter
@@ -378,8 +395,9 @@ def _add_run(commands: Any) -> None:
         "generate a population",
         "Overrides are Hydra's: a group as in env=overcooked/cramped_room, scale=laptop, cluster=gpu_node or "
         "tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for run.seed=1. "
-        "Keys of --json: run_id, run_dir, population (paths), matrix (mean and standard_error, row = seat 0, column = "
-        "seat 1), ledger (steps by member and kind), seconds; with --dry-run the whole configuration instead.",
+        "Keys of --json: run_id, run_dir and population (paths), members (how many), matrix (mean and standard_error, "
+        "row = seat 0, column = seat 1), ledger (environment steps by member and kind), evaluation (as `evaluate "
+        "--json`), files (the report's), seconds; with --dry-run the whole configuration instead.",
     )
     run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
     run.add_argument("--dry-run", action="store_true", help="check everything, print the configuration, start nothing")

@@ -19,7 +19,7 @@ from popgen.errors import UserError
 
 def _a_number(value: Any) -> Any:
     if isinstance(value, bool | str):
-        raise ValueError("Input should be a number")
+        raise ValueError("should be a number")
     return value
 
 
@@ -86,6 +86,7 @@ class WorldModelConfig(Schema):
     continue_scale: Weight = 1.0
     kl_predecessors: Weight = 0.0
     predecessors: Literal["partner", "latest", "all"] = "partner"
+    imagination: Literal["mode", "sample"] = "mode"
 
     @model_validator(mode="after")
     def _groups_divide(self) -> WorldModelConfig:
@@ -121,7 +122,7 @@ class AgentConfig(Schema):
     xp_starts: Literal["partner", "any"] = "partner"
     partner: Literal["max_window", "max_buffer"] = "max_window"
     partner_random: Fraction = 0.3
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
 
 class ReplayConfig(Schema):
@@ -135,13 +136,14 @@ class Phase1Config(Schema):
     """Member 1: self-play together with the world model."""
 
     envs: Positive = 64
-    prefill_steps: NonNegative = 256_000
+    prefill_steps: Positive = 256_000
     prefill_interact: Fraction = 0.3
-    pretrain_updates: NonNegative = 600
+    pretrain_updates: Positive = 1500
     steps_per_iteration: Positive = 100
-    model_updates: NonNegative = 25
+    model_updates: Positive = 25
     agent_updates: Positive = 25
-    recent_fraction: Fraction = 0.0
+    recent_fraction: Fraction = 0.5
+    recent_rows: Positive = 50_000
     max_steps: Positive = 680_000
     restart_after: NonNegative = 0
     restart_updates: NonNegative = 0
@@ -282,4 +284,4 @@ def _as_user_error(error: ValidationError) -> UserError:
     got = first.get("input")
     shown = "" if isinstance(got, BaseModel | dict) else f" (got {got!r})"
     fix = "give it a value" if first["type"] == "missing" else "correct the value"
-    return UserError(where, first["msg"].removeprefix("Value error, ") + shown, fix)
+    return UserError(where, first["msg"].removeprefix("Value error, ").replace("Input should", "should") + shown, fix)

@@ -6,7 +6,9 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,16 @@ from popgen.tracking import check_uri
 
 MARGIN = 256 * 2**20
 """Bytes of disk beside buffers and weights: MLflow's file, logs, plots."""
+
+SIZES = {
+    "world_model": (
+        *("view", "encoder_layers", "decoder_layers", "cnn_kernels", "cnn_channels", "units", "deter"),
+        *("recurrent_units", "prior_layers", "posterior_layers", "head_layers", "groups", "joint_groups", "classes"),
+        *("activation", "norm"),
+    ),
+    "agent": ("units", "layers", "activation", "norm", "actor_input"),
+}
+"""Fields that decide the shape of the weights a continued run takes over."""
 
 _RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -51,19 +63,14 @@ def check_run_id(name: str | None) -> None:
 
 
 def buffer_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Estimated bytes of the two full replay buffers.
-
-    A step is kept as two states (before and after it) in the environment's dtype, the actions and events of the P
-    players, and some 16 bytes of flags, reward and episode position.
-    """
+    """Bytes of the two full replay buffers: a state, actions, events and some 24 bytes of marks for each step."""
     state = spec.state_size * np.dtype(spec.state_dtype).itemsize
-    step = 2 * state + spec.num_players * (1 + spec.num_events) + 16
-    return 2 * config.replay.capacity * step
+    return 2 * config.replay.capacity * (state + spec.num_players * (1 + spec.num_events) + 24)
 
 
 def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Estimated bytes of the run's folder: two checkpoints at a time (old and new), each with both buffers."""
-    return 2 * buffer_bytes(config, spec) + MARGIN
+    """Bytes of the run's folder at most: a checkpoint with both buffers for each member, and one being written."""
+    return (config.population.size + 1) * buffer_bytes(config, spec) + MARGIN
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
@@ -100,6 +107,10 @@ def _build(config: RunConfig) -> EnvSpec:
     try:
         return make_env(config.env.name, 1, seed=config.run.seed, **config.env.params).spec
     except UserError as error:
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", error.problem)
+        if unknown:
+            problem = f"{config.env.name} has no such parameter"
+            raise UserError(f"env.params.{unknown[1]}", problem, error.fix) from None
         name = error.field.removeprefix("env.")
         field = f"env.params.{name}" if name in config.env.params else "env.name" if name == "layout" else error.field
         raise UserError(field, error.problem, error.fix) from None
@@ -124,18 +135,35 @@ def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
 def _check_start(config: RunConfig, spec: EnvSpec) -> None:
     from popgen.population import check_compatible, load_population
 
-    path = str(config.population.init_from)
+    run, wanted = Path(str(config.population.init_from)), config.population.init_members
     try:
-        population = load_population(path)
+        population = load_population(run / "population")
     except UserError as error:
-        raise UserError("population.init_from", f"{error.field} {error.problem}", error.fix) from None
+        raise UserError("population.init_from", f"{error.field} {error.problem}", "give a run's folder") from None
     check_compatible(population, spec)
-    wanted = config.population.init_members
     if wanted > len(population):
-        raise UserError("population.init_members", f"{wanted}, but {path} has {len(population)}", "lower it")
+        raise UserError("population.init_members", f"{wanted}, but {run} has {len(population)}", "lower it")
     if wanted >= config.population.size:
-        problem = f"{config.population.size} leaves nothing to train after {wanted} members from {path}"
+        problem = f"{config.population.size} leaves nothing to train after {wanted} members of {run}"
         raise UserError("population.size", problem, "raise it above population.init_members")
+    first = population.info(1)
+    if first.kind != "world_model":
+        raise UserError(
+            "population.init_from", f"{run} has members of kind {first.kind}", "choose a run of this method"
+        )
+    _check_sizes(config, first.config, run)
+    if not (run / "checkpoints" / f"member_{wanted:03d}").is_dir():
+        problem = f"{run} has no checkpoint of member {wanted}"
+        raise UserError("population.init_members", problem, "choose a member that has one")
+
+
+def _check_sizes(config: RunConfig, known: Mapping[str, Any], run: Path) -> None:
+    ours = config.model_dump(mode="json")
+    for section, names in SIZES.items():
+        for name in names:
+            there, here = known.get(section, {}).get(name), ours[section][name]
+            if there != here:
+                raise UserError(f"{section}.{name}", f"is {here!r}, but {there!r} in {run}", "use the same sizes")
 
 
 def _gib(size: int) -> str:

@@ -15,7 +15,6 @@ import urllib.request
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from popgen.config import TrackingConfig
 from popgen.errors import UserError
@@ -46,7 +45,7 @@ def check_uri(uri: str | None, timeout: float = 5.0) -> None:
     """
     if uri is None:
         return
-    scheme = urlsplit(uri).scheme.partition("+")[0]
+    scheme = uri.partition(":")[0].partition("+")[0].lower()
     if scheme not in _SCHEMES:
         raise UserError("tracking.uri", f"cannot track to {uri!r}", f"use null or one of {'://, '.join(_SCHEMES)}://")
     if scheme not in ("http", "https"):

@@ -31,3 +31,22 @@ def random_population(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for member in (1, 2):
         writer.add_member(RandomPolicy(spec.num_actions), seed=member, steps={"SP": 100 * member, "XP": 10})
     return path
+
+
+@pytest.fixture(scope="session")
+def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's folder with two untrained members of the sizes of scale=smoke, and a checkpoint folder of the first."""
+    from popgen.cli import compose
+    from popgen.config import RunConfig
+    from popgen.envs import make_env
+    from popgen.policies.world_model_policy import WorldModelPolicy
+    from popgen.population import PopulationWriter
+
+    run = tmp_path_factory.mktemp("run") / "old"
+    (run / "checkpoints" / "member_001").mkdir(parents=True)
+    config = RunConfig.parse(compose(["scale=smoke"]))
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    writer = PopulationWriter(run / "population", spec, method="xpm_wm", config_digest=config.digest(), seed=0)
+    for member in (1, 2):
+        writer.add_member(WorldModelPolicy(config.world_model, config.agent, spec), seed=member, steps={"SP": 1})
+    return run

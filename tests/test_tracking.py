@@ -47,9 +47,9 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     return second
 
 
-def test_everything_lies_in_the_run_folder(tracked: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_everything_lies_in_the_run_folder(tracked: Tracker) -> None:
     assert {"mlflow.db", "mlflow_artifacts", "report"} == {path.name for path in tracked.run_dir.iterdir()}
-    assert [path.name for path in client(tracked).list_artifacts(tracked.state()["runs"]["parent"])] == ["report"]
+    assert [file.path for file in client(tracked).list_artifacts(tracked.state()["runs"]["parent"])] == ["report"]
     assert len(list(tracked.run_dir.rglob("mlflow_artifacts/**/matrix.json"))) == 2
 
 

@@ -17,7 +17,7 @@ ARRAYS, VALUES = "arrays.safetensors", "values.json"
 
 
 def save_state(folder: str | Path, state: dict[str, Any]) -> None:
-    """Write `state` so that `folder` holds either the old contents or the new, whatever interrupts it."""
+    """Write `state` so that `load_state` finds either the old contents or the new, whatever interrupts it."""
     folder = Path(folder)
     fresh = folder.with_name(folder.name + ".writing")
     shutil.rmtree(fresh, ignore_errors=True)
@@ -29,9 +29,9 @@ def save_state(folder: str | Path, state: dict[str, Any]) -> None:
     for path in fresh.iterdir():
         with open(path, "rb") as file:
             os.fsync(file.fileno())
-    old = folder.with_name(folder.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
+    old = _old(folder)
     if folder.exists():
+        shutil.rmtree(old, ignore_errors=True)
         folder.rename(old)
     fresh.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
@@ -44,10 +44,13 @@ def load_state(folder: str | Path) -> dict[str, Any]:
         UserError: missing or damaged files.
     """
     folder = Path(folder)
+    whole = folder if folder.exists() else _old(folder)
     try:
-        arrays = load_file(str(folder / ARRAYS))
-        values = json.loads((folder / VALUES).read_text())
-        return _merge(values, arrays)
+        arrays = load_file(str(whole / ARRAYS))
+        state = _merge(json.loads((whole / VALUES).read_text()), arrays)
+        if not isinstance(state, dict):
+            raise ValueError(f"{VALUES} holds no dictionary")
+        return state
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(str(folder), f"unreadable checkpoint ({error})", "remove it or start a new run") from None
     except Exception as error:  # safetensors raises its own type, which it does not export in all versions
@@ -56,9 +59,14 @@ def load_state(folder: str | Path) -> dict[str, Any]:
         raise
 
 
+def _old(folder: Path) -> Path:
+    """Where the old contents are for the moment between the two renames of `save_state`."""
+    return folder.with_name(folder.name + ".old")
+
+
 def _split(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, np.ndarray):
-        arrays[path] = np.ascontiguousarray(value)
+        arrays[path] = np.asarray(value, order="C")
         return {"__array__": path}
     if isinstance(value, dict):
         return {str(key): _split(item, f"{path}/{key}", arrays) for key, item in value.items()}

@@ -42,6 +42,7 @@ class Query:
     owner: member during whose training the row was collected, with `owner_is` "equal" or "below".
     partner: the other member of cross-play rows.
     recent: only this last share of the rows that match.
+    last: only so many of the last rows that match.
     """
 
     owner: int | None = None
@@ -49,6 +50,7 @@ class Query:
     kind: Kind | None = None
     partner: int | None = None
     recent: float = 1.0
+    last: int | None = None
 
 
 class Replay:
@@ -121,7 +123,7 @@ class Replay:
         return rows
 
     def rows(self, query: Query, event: int | None = None) -> np.ndarray:
-        """Row numbers that match (and at which `event` happened), oldest first; cached until the next add."""
+        """Row numbers that match (and at which a window can show `event`), oldest first; cached until the next add."""
         key = (query, event)
         if key not in self._cache:
             match = self.stream[: self.size] >= 0
@@ -134,9 +136,12 @@ class Replay:
                 match = match & (self.partner[: self.size] == query.partner)
             found = np.flatnonzero(match)
             found = found[np.argsort(self.age[found], kind="stable")]
-            found = found[len(found) - int(np.ceil(len(found) * query.recent)) :]
+            kept = int(np.ceil(len(found) * query.recent))
+            found = found[len(found) - (kept if query.last is None else min(kept, query.last)) :]
             if event is not None:
                 found = found[self.events[found, :, event].any(1)]
+                # A window shows an event at the state it led to, which is not stored where an episode was cut.
+                found = found[self._whole(found, 2) & ~self.first[(found + 1) % self.capacity]]
             self._cache[key] = found
         return self._cache[key]
 
@@ -158,12 +163,15 @@ class Replay:
         return starts
 
     def before_events(self, batch: int, length: int, query: Query, events: list[int], reach: int) -> np.ndarray:
-        """First rows of windows whose last state lies up to `reach` steps before one of the events."""
+        """First rows of windows whose last state lies up to `reach` steps before one of the events, in its episode."""
         found = np.unique(np.concatenate([self.rows(query, event) for event in events])) if events else np.array([], int)
         if not len(found):
             return self.sample(batch, length, query)
         lead = self.rng.integers(0, reach, size=batch * 4)
-        starts = found[self.rng.integers(0, len(found), size=batch * 4)] - lead - (length - 1)
+        picked = found[self.rng.integers(0, len(found), size=batch * 4)]
+        last, episode = picked - lead, np.cumsum(self.first[: self.size])
+        same = (self.stream[last] == self.stream[picked]) & (episode[last] == episode[picked])
+        starts = (last - (length - 1))[same]
         starts = starts[self._whole(starts, length)][:batch]
         missing = batch - len(starts)
         return np.concatenate([starts, self.sample(missing, length, query)]) if missing else starts

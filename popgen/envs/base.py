@@ -84,6 +84,21 @@ class BatchedEnv(ABC):
         """Play joint `actions` (B, P); raises ValueError on a wrong shape or an unknown action."""
 
     @abstractmethod
+    def simulate(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, StepBatch]:
+        """The exact dynamics F as a pure function: the environment's own states do not change.
+
+        Args:
+            states: (..., S), with any leading shape.
+            actions: (..., P).
+
+        Returns:
+            The next states (..., S), and what the step gave, with the leading shape in place of B.
+
+        Raises:
+            ValueError: wrong shape or dtype, or an unknown action.
+        """
+
+    @abstractmethod
     def get_state(self, indices: np.ndarray | None = None) -> np.ndarray:
         """Copy of the states, (B, S): all that determines the future, the time step included."""
 

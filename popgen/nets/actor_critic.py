@@ -7,9 +7,8 @@ from torch import Tensor, nn
 
 from popgen.config import AgentConfig, WorldModelConfig
 from popgen.nets.blocks import mlp
-from popgen.nets.latents import player_masks
+from popgen.nets.latents import Latent, player_masks
 from popgen.nets.two_hot import TwoHot
-from popgen.world_model.model import Latent
 
 
 class Actor(nn.Module):

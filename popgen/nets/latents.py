@@ -6,8 +6,25 @@ second to last, every operation runs over the G groups contiguously (about ten t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Latent:
+    """Model state: h (..., D) deterministic, z (..., C * G) flat one-hot sample."""
+
+    h: Tensor
+    z: Tensor
+
+    def flat(self) -> Tensor:
+        """(..., D + C * G), the input of every head and critic."""
+        return torch.cat([self.h, self.z], -1)
+
+    def __getitem__(self, index: object) -> Latent:
+        return Latent(self.h[index], self.z[index])
 
 
 def probabilities(logits: Tensor, unimix: float) -> Tensor:
@@ -25,6 +42,12 @@ def sample_one_hot(probs: Tensor, generator: torch.Generator | None = None) -> T
     one_hot = passed.clone()
     one_hot[..., 1:, :] -= passed[..., :-1, :]
     return one_hot
+
+
+def mode_one_hot(probs: Tensor) -> Tensor:
+    """The most likely class of every group, one-hot (..., C, G); no gradient."""
+    best = probs.argmax(dim=-2, keepdim=True)
+    return torch.zeros_like(probs).scatter_(-2, best, 1.0)
 
 
 def straight_through(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import nn
@@ -14,9 +16,25 @@ def weights_of(module: nn.Module) -> Weights:
     return {name: value.detach().cpu().numpy().copy() for name, value in module.state_dict().items()}
 
 
-def load_weights(module: nn.Module, weights: Weights) -> None:
-    """Fill a module; raises RuntimeError naming missing, unexpected or misshapen entries."""
-    module.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+def load_weights(module: nn.Module, weights: Mapping[str, np.ndarray], *, cast: bool = False) -> None:
+    """Copy named arrays into a module; `cast` allows a module in another precision than the arrays'.
+
+    Raises:
+        ValueError: a tensor is missing, unknown or of another shape or dtype; the message names it.
+    """
+    own = module.state_dict()
+    if missing := sorted(own.keys() - weights.keys()):
+        raise ValueError(f"tensor {missing[0]!r} is missing")
+    if unknown := sorted(weights.keys() - own.keys()):
+        raise ValueError(f"tensor {unknown[0]!r} is not one of the policy's")
+    loaded = {name: torch.from_numpy(np.array(weights[name])) for name in own}
+    for name, tensor in own.items():
+        if loaded[name].shape != tensor.shape:
+            raise ValueError(f"tensor {name!r} has shape {tuple(loaded[name].shape)}, expected {tuple(tensor.shape)}")
+        if loaded[name].dtype != tensor.dtype and not cast:
+            raise ValueError(f"tensor {name!r} is {loaded[name].dtype}, expected {tensor.dtype}")
+    for name, tensor in own.items():
+        tensor.copy_(loaded[name])
 
 
 def prefixed(prefix: str, weights: Weights) -> Weights:

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from popgen.envs.base import EnvSpec, ViewSpec
-from popgen.policies.tensors import load_weights, module_weights
+from popgen.nets.weights import load_weights, weights_of
 from popgen.shapes import check
 
 
@@ -170,7 +170,7 @@ class FeedForwardPolicy:
 
     def weights(self) -> dict[str, np.ndarray]:
         """The network's parameters."""
-        return module_weights(self.net)
+        return weights_of(self.net)
 
     @classmethod
     def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> Self:

@@ -7,12 +7,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import nn
 
 from popgen.config import AgentConfig, WorldModelConfig
 from popgen.envs.base import EnvSpec
 from popgen.nets import weights as w
 from popgen.nets.actor_critic import Actor
-from popgen.world_model.model import Latent, LatentFilter
+from popgen.nets.latents import Latent
+from popgen.world_model.model import LatentFilter
 
 
 class WorldModelPolicy:
@@ -26,8 +28,8 @@ class WorldModelPolicy:
     def __init__(self, model: WorldModelConfig, agent: AgentConfig, spec: EnvSpec) -> None:
         self._model, self._agent, self._spec = model, agent, spec
         self.view = model.view
-        self.filter = LatentFilter(model, spec).eval().requires_grad_(False)
-        self.actor = Actor(agent, model, spec.num_actions).eval().requires_grad_(False)
+        self.filter, self.actor = LatentFilter(model, spec), Actor(agent, model, spec.num_actions)
+        self._parts = nn.ModuleDict({"filter": self.filter, "actor": self.actor}).eval().requires_grad_(False)
         self._generator = torch.Generator()
         self._latent: Latent | None = None
 
@@ -58,12 +60,11 @@ class WorldModelPolicy:
 
     def weights(self) -> w.Weights:
         """`filter.*` and `actor.*`."""
-        return w.prefixed("filter", w.weights_of(self.filter)) | w.prefixed("actor", w.weights_of(self.actor))
+        return w.weights_of(self._parts)
 
-    def load(self, weights: w.Weights) -> None:
-        """Take over `weights()` of a policy of the same sizes; the running episodes' latents stay."""
-        w.load_weights(self.filter, w.under("filter", weights))
-        w.load_weights(self.actor, w.under("actor", weights))
+    def load(self, weights: Mapping[str, np.ndarray]) -> None:
+        """Take over `weights()` of a policy of the same sizes (else ValueError); the running episodes' latents stay."""
+        w.load_weights(self._parts, weights)
 
     @classmethod
     def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> WorldModelPolicy:
@@ -71,8 +72,5 @@ class WorldModelPolicy:
         policy = cls(
             WorldModelConfig.model_validate(config["world_model"]), AgentConfig.model_validate(config["agent"]), spec
         )
-        try:
-            policy.load(dict(weights))
-        except RuntimeError as error:
-            raise ValueError(" ".join(str(error).split())) from None
+        policy.load(weights)
         return policy

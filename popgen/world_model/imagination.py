@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from popgen.world_model.model import Latent, WorldModel
+from popgen.nets.latents import Latent
+from popgen.world_model.model import WorldModel
 
 JointActor = Callable[[Latent], Tensor]
 """Joint actions (B, P) int64 for a batch of model states."""

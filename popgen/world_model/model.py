@@ -23,22 +23,8 @@ from popgen.config import WorldModelConfig
 from popgen.envs.base import EnvSpec, ViewSpec
 from popgen.nets import latents
 from popgen.nets.blocks import ConvDecoder, ConvEncoder, NormGRUCell, mlp
+from popgen.nets.latents import Latent
 from popgen.shapes import check
-
-
-@dataclass(frozen=True)
-class Latent:
-    """Model state: h (..., D) deterministic, z (..., C * G) flat one-hot sample."""
-
-    h: Tensor
-    z: Tensor
-
-    def flat(self) -> Tensor:
-        """(..., D + C * G), the input of every head and critic."""
-        return torch.cat([self.h, self.z], -1)
-
-    def __getitem__(self, index: object) -> Latent:
-        return Latent(self.h[index], self.z[index])
 
 
 @dataclass(frozen=True)
@@ -160,7 +146,17 @@ class LatentFilter(nn.Module):
         """One step of acting: the state after seeing obs (B, P, *shape), actions (B, P) having led to it."""
         h = self.transition(*self.before(latent, actions, is_first))
         probs = self.posterior(h, self.encoder(self.scaled(obs)))
-        return Latent(h, latents.sample_one_hot(probs, generator).flatten(-2))
+        return Latent(h, self.drawn(probs, generator))
+
+    def drawn(self, probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Latents for acting and imagining, (..., C, G) -> (..., C * G).
+
+        `imagination=mode` takes the most likely class: where the task itself is deterministic, a sampled latent
+        only adds errors, and a policy learns to farm the rare ones that pay. `sample` is the paper's.
+        """
+        if self.config.imagination == "mode":
+            return latents.mode_one_hot(probs).flatten(-2)
+        return latents.sample_one_hot(probs, generator).flatten(-2)
 
     def observe_posterior(
         self, obs: Tensor, actions: Tensor, is_first: Tensor, generator: torch.Generator | None = None
@@ -223,9 +219,9 @@ class WorldModel(nn.Module):
         return Observed(latent, posterior, self.prior(latent.h))
 
     def step(self, latent: Latent, actions: Tensor, generator: torch.Generator | None = None) -> Latent:
-        """One step of imagination: (h, z)_{t+1} from (h, z)_t and joint actions (B, P), z from the prior."""
+        """One step of imagination: (h, z)_{t+1} from (h, z)_t and joint actions (B, P), z drawn from the prior."""
         h = self.filter.transition(latent, actions)
-        return Latent(h, latents.sample_one_hot(self.prior(h), generator).flatten(-2))
+        return Latent(h, self.filter.drawn(self.prior(h), generator))
 
     def player_latent(self, latent: Latent, player: int) -> Tensor:
         """(h, z^i) with the other player's private groups blanked: (..., D + C * G)."""
@@ -245,8 +241,14 @@ class WorldModel(nn.Module):
         return self.event_head(latent.flat())
 
     def reward(self, latent: Latent) -> Tensor:
-        """Expected joint reward (...): w . p(r | h, z), summed over players (paper, "event-based rewards")."""
-        return (torch.sigmoid(self.event_logits(latent)) * self.event_weights).sum(-1)
+        """Joint reward (...): w . p(r | h, z), summed over players (paper, "event-based rewards").
+
+        With `imagination=mode` an event less likely than not counts for nothing.
+        """
+        probs = torch.sigmoid(self.event_logits(latent))
+        if self.config.imagination == "mode":
+            probs = probs * (probs > 0.5)
+        return (probs * self.event_weights).sum(-1)
 
     def continuation(self, latent: Latent) -> Tensor:
         """Probability (...) that the episode goes on from this state."""

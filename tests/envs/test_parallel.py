@@ -106,6 +106,13 @@ def test_render_modes(name):
     assert picture.metadata["name"] == name
 
 
+def test_reset_hands_the_seed_on():
+    env = parallel_env("rendezvous/mppmr", start_noise=0.2, seed=1)
+    starts = [env.reset(seed=seed)[0]["player_0"].tolist() for seed in (5, None, 6, 5)]
+    assert starts[3] == starts[0]
+    assert starts[1] != starts[0] != starts[2] != starts[1]
+
+
 def test_a_finished_episode_must_be_reset():
     env = parallel_env("rendezvous/mppmr", horizon=1)
     with pytest.raises(RuntimeError, match="reset"):

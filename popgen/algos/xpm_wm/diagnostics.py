@@ -7,7 +7,8 @@ import torch
 from popgen.algos.xpm_wm.model_learner import Batch, ModelLearner
 from popgen.data.replay import Windows
 from popgen.losses.world_model import event_counts
-from popgen.world_model.model import Latent, WorldModel
+from popgen.nets.latents import Latent
+from popgen.world_model.model import WorldModel
 
 OPEN_LOOP = 4
 """Steps without observations at which open-loop figures are taken."""

@@ -145,7 +145,7 @@ class ModelLearner:
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
         self.optimiser.step()
         self.updates += 1
-        metrics = {f"loss_{name}": float(term) for name, term in terms.items()}
+        metrics = {f"loss_{name}": float(term.detach()) for name, term in terms.items()}
         return metrics | {name: float(value) for name, value in extras.items()}, seen
 
     @torch.no_grad()

@@ -28,13 +28,14 @@ class Draws:
 def model_batch(config: RunConfig, member: int) -> Draws:
     """Windows of one world-model update.
 
-    Member 1 learns from everything it has; later members mix the kept buffers with their own new data, the
+    Member 1 learns from everything it has, a share of it from the last rows: a policy finds the rewards that the
+    model only imagines, and what it then does in reality must be seen often to be unlearned. Later members mix the kept buffers with their own new data, the
     latter half self-play and half cross-play.
     """
     batch, events = config.world_model.batch, config.replay.event_fraction
     if member == 1:
         recent = int(round(batch * config.phase1.recent_fraction))
-        late = (Request(Query(recent=LATE), recent, events),) if recent else ()
+        late = (Request(Query(last=config.phase1.recent_rows), recent, events),) if recent else ()
         return Draws(sp=(Request(Query(), batch - recent, events), *late))
     new = int(round(batch * config.phase2.new_fraction))
     old, old_xp = batch - new, (batch - new) // 4 if member > 2 else 0

@@ -151,15 +151,11 @@ class OvercookedEnv(BatchedEnv):
         reward, score, events, truncated = self._advance(self._states, self._actions(actions, (self.num_envs, 2)))
         return StepBatch(reward, score, events, np.zeros(self.num_envs, bool), truncated)
 
-    def simulate(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The exact dynamics as a pure function; the environment's own states do not change.
+    def simulate(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, StepBatch]:
+        """F(s, a): states (..., S) uint8 and actions (..., 2) to the next states (..., S) and what the step gave.
 
-        Args:
-            states: (..., S) uint8.
-            actions: (..., 2).
-
-        Returns:
-            next_states (..., S), reward (...) float32, score (...) float32, events (..., 2, E) uint8.
+        Pure: neither the arguments nor this environment's own states change. The arrays of the StepBatch have the
+        same leading shape as the states.
 
         Raises:
             ValueError: wrong shape or dtype, or an unknown action.
@@ -167,9 +163,15 @@ class OvercookedEnv(BatchedEnv):
         states = self._rows(states)
         lead = states.shape[:-1]
         following = states.reshape(-1, states.shape[-1]).copy()
-        reward, score, events, _ = self._advance(following, self._actions(actions, (*lead, 2)).reshape(-1, 2))
-        shape = (*lead, 2, k.NUM_EVENTS)
-        return following.reshape(states.shape), reward.reshape(lead), score.reshape(lead), events.reshape(shape)
+        reward, score, events, truncated = self._advance(following, self._actions(actions, (*lead, 2)).reshape(-1, 2))
+        batch = StepBatch(
+            reward.reshape(lead),
+            score.reshape(lead),
+            events.reshape(*lead, 2, k.NUM_EVENTS),
+            np.zeros(lead, bool),
+            truncated.reshape(lead),
+        )
+        return following.reshape(states.shape), batch
 
     def get_state(self, indices: np.ndarray | None = None) -> np.ndarray:
         """Copy of the states, (N, S) uint8."""

@@ -133,7 +133,7 @@ def _fill_bits(table: np.ndarray, codes: np.ndarray, row: int, inverse: int, pre
     Soups are thermometers of onions and of tomatoes; a bit that is always 0, or always equal to an earlier one,
     is left out (with only one possible soup, one bit says it is there).
     """
-    tests = [(f"{'onion tomato dish'.split()[code - 1]}", lambda c, code=code: c == code) for code in (ONION, TOMATO, DISH)]
+    tests = [(f"{['onion', 'tomato', 'dish'][code - 1]}", lambda c, code=code: c == code) for code in (ONION, TOMATO, DISH)]
     tests = tests if items_too else []
     for column, ingredient in ((0, "onions"), (1, "tomatoes")):
         for level in (1, 2, 3):
