@@ -116,7 +116,7 @@ class AgentConfig(Schema):
     bins: Annotated[_Int, Field(ge=3)] = 65
     slow_critic: Fraction = 0.98
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
-    lambda_xp: Weight = 0.25
+    lambda_xp: Weight = 0.5
     lambda_warmup: NonNegative = 0
     sp_from_xp: Fraction = 0.5
     xp_starts: Literal["partner", "any"] = "partner"
@@ -148,25 +148,25 @@ class Phase1Config(Schema):
     restart_after: NonNegative = 0
     restart_updates: NonNegative = 0
     check_every: Positive = 5
-    target_score: Number = 11.0
+    target_score: Number = 10.5
     patience: Positive = 1000
 
 
 class Phase2Config(Schema):
     """Members 2..M: mostly imagination, few real episodes."""
 
-    first_updates: Positive = 600
-    updates_per_round: Positive = 200
+    first_updates: Positive = 500
+    updates_per_round: Positive = 150
     model_updates: NonNegative = 60
     model_lr: Rate = 5e-4
-    episodes_sp: Positive = 16
-    episodes_xp: Positive = 16
-    rounds: Positive = 4
+    episodes_sp: Positive = 8
+    episodes_xp: Positive = 8
+    rounds: Positive = 9
     max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
     cache: Positive = 8192
     starts_random: Fraction = 0.34
     starts_event: Fraction = 0.30
-    starts_new: Fraction = 0.30
+    starts_new: Fraction = 0.5
     event_reach: Positive = 10
     new_fraction: Fraction = 0.5
 

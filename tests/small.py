@@ -27,8 +27,11 @@ MODEL = WorldModelConfig(
     classes=4,
     batch=6,
     length=5,
+    imagination="sample",
 )
-AGENT = AgentConfig(units=16, layers=1, horizon=3, starts_sp=6, starts_xp=4, bins=15, partner_random=0.0)
+AGENT = AgentConfig(
+    units=16, layers=1, horizon=3, starts_sp=6, starts_xp=4, bins=15, partner_random=0.0, precision="float32"
+)
 PRIVATE = ((2, 3), (4, 5))
 """Groups of MODEL that belong to player 0 and to player 1; 0 and 1 are joint."""
 

@@ -196,9 +196,7 @@ def evaluate_population(
     count = len(chosen)
     # All pairs but those of the two partners among themselves.
     teams = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
-    played = play_teams(
-        population.make_env, policies, teams, episodes, seed=seed, max_envs=max_envs, progress=progress
-    )
+    played = play_teams(population.make_env, policies, teams, episodes, seed=seed, max_envs=max_envs, progress=progress)
     pairings = {}
     for n, (i, j) in enumerate(teams):
         rows = slice(n * episodes, (n + 1) * episodes)

@@ -11,13 +11,15 @@ Keys of the JSON object (`to_json`); a figure is `{"mean": x, "standard_error": 
     sp, xp                   figures: mean self-play over members; mean cross-play over ordered pairs i != j
     matrix                   mean and standard_error, lists of rows: row = seat 0, column = seat 1
     beside                   random and idle: `both` seats, partner in `seat_0`, partner in `seat_1`, all figures
-    obstruction              random and idle: is xp below `beside.*.both`, by more than two standard errors; pairs: for each
-                             ordered pair below a member's own play beside such a partner, pair, partner, member,
-                             xp and beside
+    obstruction              random and idle: is xp below `beside.*.both` by more than two standard errors; pairs: for
+                             each ordered pair that is below a member's own play beside such a partner: pair, partner,
+                             member, xp and beside
     event_names, event_weights
     pairs                    every pairing: seat_0, seat_1 (a member's number, "random" or "idle"), score, reward and
-                             shaped return (sum over seats) as figures, scores of the episodes, events (mean count per
-                             episode: a list per seat, in the order of event_names)
+                             shaped_return (sum over seats) as figures; scores of the episodes; events: mean count per
+                             episode, a list per seat in the order of event_names
+
+Standard errors are over episodes; they say nothing of how other members would do.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from typing import Any
 from rich.table import Table
 
 from popgen.errors import UserError
-from popgen.evaluation.crossplay import IDLE, PARTNERS, RANDOM, CrossPlayResult, Estimate, Pairing
+from popgen.evaluation.crossplay import IDLE, PARTNERS, RANDOM, CrossPlayResult, Estimate, Obstruction, Pairing
 
 CSV_FIELDS = (
     "seat_0",
@@ -68,10 +70,6 @@ def to_dict(result: CrossPlayResult) -> dict[str, Any]:
         }
         for partner in PARTNERS
     }
-    pairs = [
-        {"pair": list(o.pair), "partner": o.partner, "member": o.member, "xp": _figure(o.xp), "beside": _figure(o.beside)}
-        for o in result.obstructions
-    ]
     return {
         "format": "popgen-crossplay",
         "format_version": 1,
@@ -89,10 +87,20 @@ def to_dict(result: CrossPlayResult) -> dict[str, Any]:
             "standard_error": [[_number(cell) for cell in row] for row in error],
         },
         "beside": beside,
-        "obstruction": {**result.obstruction, "pairs": pairs},
+        "obstruction": {**result.obstruction, "pairs": [_obstruction(found) for found in result.obstructions]},
         "event_names": list(result.event_names),
         "event_weights": list(result.event_weights),
         "pairs": [_pair(pairing) for pairing in result.pairings.values()],
+    }
+
+
+def _obstruction(found: Obstruction) -> dict[str, Any]:
+    return {
+        "pair": list(found.pair),
+        "partner": found.partner,
+        "member": found.member,
+        "xp": _figure(found.xp),
+        "beside": _figure(found.beside),
     }
 
 
@@ -182,11 +190,13 @@ def to_rich(result: CrossPlayResult) -> Table:
     """The matrix as a table for the terminal, self-play in bold."""
     head, rows = _rows(result)
     table = Table(title=f"{result.environment.name}: {result.environment.score_name} per episode (± standard error)")
-    table.add_column(head[0], style="bold")
+    table.add_column(head[0].replace(" \\ ", "\n\\ "), style="bold")
     for label in head[1:]:
         table.add_column(label, justify="right")
     for number, row in enumerate(rows):
-        cells = [f"[bold]{cell}[/bold]" if k == number else cell for k, cell in enumerate(row[1:])]
+        # The error goes below its mean, so that six members fit into 80 columns.
+        narrow = [cell.replace(" ± ", "\n±") for cell in row[1:]]
+        cells = [f"[bold]{cell}[/bold]" if k == number else cell for k, cell in enumerate(narrow)]
         table.add_row(row[0], *cells)
     return table
 

@@ -155,7 +155,7 @@ class LatentFilter(nn.Module):
         only adds errors, and a policy learns to farm the rare ones that pay. `sample` is the paper's.
         """
         if self.config.imagination == "mode":
-            return latents.mode_one_hot(probs).flatten(-2)
+            return latents.mode_one_hot(probs).to(probs.dtype).flatten(-2)
         return latents.sample_one_hot(probs, generator).flatten(-2)
 
     def observe_posterior(

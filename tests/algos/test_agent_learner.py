@@ -9,14 +9,14 @@ import torch
 from small import AGENT, MODEL, kitchen, random_latent
 from torch import Tensor
 
-from popgen.algos.xpm_wm.agent_learner import SELF, AgentLearner
+from popgen.algos.xpm_wm.agent_learner import SELF, AgentLearner, rollout_dtype
 from popgen.algos.xpm_wm.starts import NEW_SP, NEW_XP, OLD, Starts
 from popgen.data.checkpoint import load_state, save_state
 from popgen.losses.returns import lambda_return
 from popgen.nets import weights as w
 from popgen.nets.actor_critic import Actor
+from popgen.nets.latents import Latent
 from popgen.world_model.imagination import Imagined
-from popgen.world_model.model import Latent
 
 SPEC = kitchen().spec
 ACTIONS = SPEC.num_actions
@@ -324,6 +324,11 @@ def test_half_precision_imagines_and_trains_in_full() -> None:
     assert {p.dtype for p in learner.rollout_actor.parameters()} == {torch.bfloat16}
     learner.load_state(learner.state())
     assert np.isfinite(list(learner.update().values())).all()
+
+
+def test_precision_auto_is_one_of_the_two() -> None:
+    assert rollout_dtype("float32") is torch.float32 and rollout_dtype("bfloat16") is torch.bfloat16
+    assert rollout_dtype("auto") in (torch.float32, torch.bfloat16)
 
 
 def test_update_needs_starts() -> None:

@@ -75,9 +75,11 @@ def test_nothing_is_predicted_into_a_beginning() -> None:
     # By hand, over the steps that count.
     learner.generator.manual_seed(0)
     batch = Batch.of(windows, learner.model)
-    _, seen, extras = learner.losses(batch)
-    kl = (seen.posterior * (seen.posterior.log() - seen.prior.log())).sum((-2, -1))
-    assert float(extras["kl"]) == pytest.approx(float(kl[~batch.is_first].detach().mean()), rel=1e-5)
+    terms, seen, extras = learner.losses(batch)
+    kl = (seen.posterior * (seen.posterior.log() - seen.prior.log())).sum((-2, -1))[~batch.is_first].detach()
+    weight = learner.config.kl_dyn + learner.config.kl_rep
+    assert float(extras["kl"]) == pytest.approx(float(kl.mean()), rel=1e-5)
+    assert float(terms["kl"].detach()) == pytest.approx(weight * float(kl.clamp(min=1.0).mean()), rel=1e-5)
 
 
 def test_terminal_states_are_where_the_episode_stops() -> None:
@@ -204,7 +206,7 @@ def test_starts_are_posterior_states_that_are_neither_terminal_nor_first() -> No
         (match,) = np.argwhere((seen.latent.h.numpy() == h).all(-1)).tolist()
         t, b = match
         assert partner == PARTNERS[b]
-        assert torch.equal(from_indices(torch.from_numpy(z), MODEL.classes).flatten(-2), seen.latent.z[t, b])
+        torch.testing.assert_close(from_indices(torch.from_numpy(z), MODEL.classes).flatten(-2), seen.latent.z[t, b])
         places.add((t, b))
     assert places == {(t, b) for t in (2, 3, 4) for b in range(6)} - {(2, 1), (4, 4)}
 

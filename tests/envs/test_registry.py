@@ -44,6 +44,26 @@ def test_params_make_the_same_environment_again(name):
     assert dataclasses.asdict(again) == dataclasses.asdict(spec)
 
 
+def test_simulate_is_step_for_any_leading_shape(name):
+    env = make_env(name, BATCH, seed=3)
+    play(env, 12, seed=1)
+    env.set_time(np.arange(BATCH) + env.spec.horizon - BATCH + 1)
+    before, rng = env.get_state(), np.random.default_rng(0)
+    actions = rng.integers(env.spec.num_actions, size=(BATCH, 2))
+    following, simulated = env.simulate(before.reshape(2, BATCH // 2, -1), actions.reshape(2, BATCH // 2, 2))
+    assert np.array_equal(env.get_state(), before), "simulate must not touch the environment's own states"
+    batch = env.step(actions)
+    assert np.array_equal(following.reshape(before.shape), env.get_state()) and batch.truncated.any()
+    for field in dataclasses.fields(batch):
+        stepped, pure = getattr(batch, field.name), getattr(simulated, field.name)
+        assert pure.shape[:2] == (2, BATCH // 2) and np.array_equal(pure.reshape(stepped.shape), stepped), field.name
+    single, one = env.simulate(before[0], actions[0])
+    assert np.array_equal(single, following[0, 0]) and one.reward.shape == () and one.events.shape == batch.events[0].shape
+    for wrong in (actions[:1], actions[0] + env.spec.num_actions):
+        with pytest.raises(ValueError):
+            env.simulate(before[0], wrong)
+
+
 def test_step_shapes_and_dtypes(name):
     env = make_env(name, BATCH)
     assert isinstance(env, BatchedEnv) and env.num_envs == BATCH

@@ -196,6 +196,32 @@ def test_step_follows_the_transition_and_the_prior() -> None:
     assert (drawn.mean(0) - wanted).abs().max() < 4 * np.sqrt(0.25 / 500)
 
 
+def test_mode_takes_the_likeliest_class_in_acting_and_in_imagination() -> None:
+    model, latent = make_model(MODEL.model_copy(update={"imagination": "mode"})), random_latent(20)
+    actions = torch.randint(0, 6, (20, 2), generator=generator())
+    best = model.prior(model.filter.transition(latent, actions)).argmax(-2)
+    for draws in (generator(1), generator(2)):
+        z = model.step(latent, actions, draws).z.unflatten(-1, (MODEL.classes, MODEL.groups))
+        assert torch.equal(z.argmax(-2), best) and (z.sum(-2) == 1).all() and ((z == 0) | (z == 1)).all()
+    obs, before, is_first = window(4, 1)
+    state = model.filter.filter(model.filter.initial(4), obs[0], before[0], is_first[0], generator(3))
+    posterior = model.filter.posterior(state.h, model.filter.encoder(model.filter.scaled(obs[0])))
+    z = state.z.unflatten(-1, (MODEL.classes, MODEL.groups))
+    assert torch.equal(z.argmax(-2), posterior.argmax(-2)) and (z.sum(-2) == 1).all()
+
+
+def test_mode_counts_events_that_are_more_likely_than_not() -> None:
+    probs = torch.tensor([0.9, 0.4, 0.51, 0.0, 0.2, 0.3, 0.7, 0.1, 0.49, 0.6])  # (P, E) = (2, 5)
+    weights = np.tile(np.array(SPEC.event_weights), 2)
+    for imagination, counted in (("sample", probs), ("mode", torch.where(probs > 0.5, probs, 0.0))):
+        model = make_model(MODEL.model_copy(update={"imagination": imagination}))
+        with torch.no_grad():
+            model.event_head[-1].weight.zero_()
+            model.event_head[-1].bias.copy_(torch.logit(probs, eps=1e-9))
+        reward = model.reward(random_latent(3)).detach()
+        assert reward.tolist() == pytest.approx([float((counted.numpy() * weights).sum())] * 3, rel=1e-4)
+
+
 def test_a_view_that_is_not_there_is_named() -> None:
     from popgen.envs import make_env
 

@@ -206,7 +206,7 @@ class OvercookedEnv(BatchedEnv):
         if view == "features":
             k.encode_features(rows, self.spec.state_size, tables.table, tables.meta, flat)
         else:
-            k.encode_lossless(rows, self.spec.state_size, 2, tables.table, tables.meta, tables.walls, flat)
+            k.encode_lossless(rows, self.spec.state_size, tables.table, tables.meta, tables.walls, flat)
         return out
 
     def observe(self, view: str = "features", out: np.ndarray | None = None) -> np.ndarray:
@@ -229,12 +229,7 @@ class OvercookedEnv(BatchedEnv):
 
     def features_to_lossless(self, features: np.ndarray) -> np.ndarray:
         """The `lossless` view (..., W, H, 26) of the player whose `features` (..., F) these are."""
-        states = self.features_to_states(features)
-        shape = self.spec.views["lossless"].shape
-        out = np.empty((*states.shape[:-1], *shape), np.uint8)
-        rows, flat, tables = states.reshape(-1), out.reshape(-1), self.tables
-        k.encode_lossless(rows, self.spec.state_size, 1, tables.table, tables.meta, tables.walls, flat)
-        return out
+        return self.encode(self.features_to_states(features), "lossless")[..., 0, :, :, :]
 
     def time(self, states: np.ndarray) -> np.ndarray:
         """Time step within the episode of any states (..., S) -> (...) int64."""
@@ -261,7 +256,9 @@ class OvercookedEnv(BatchedEnv):
         """What each entry of `features` says, such as `self_at_1,2`."""
         return self.tables.feature_names
 
-    def _advance(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _advance(
+        self, states: np.ndarray, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Step `states` in place; the results are new arrays, which callers may keep."""
         count = len(states)
         reward, score = np.empty(count, np.float32), np.empty(count, np.float32)

@@ -12,6 +12,9 @@ from __future__ import annotations
 
 from numba import njit
 
+# `_nrt=False` below: the kernels allocate nothing, and without it numba counts references to every array at every
+# call of a helper, which made encoding six times slower
+
 # bytes of the state row
 ORIENT, HELD, TIME, POTS = 2, 4, 6, 8
 # rows of the table
@@ -156,49 +159,55 @@ def step(states, size, actions, table, values, meta, reward, score, events, trun
 
 
 @njit(_nrt=False)
-def _set_item(out, at, item, table, bit_row):
-    """Set the bits of an object; objects that cannot exist here have none."""
-    first = table[bit_row, item]
-    if first >= 0:
-        out[at + first] = 1
-        out[at + table[bit_row + 1, item]] = 1
-        out[at + table[bit_row + 2, item]] = 1
+def _set_item(out, at, other, item, table, bit_row):
+    """Set the bits of an object at out[at:] and out[other:]; objects that cannot exist here have none."""
+    for row in range(bit_row, bit_row + 3):
+        bit = table[row, item]
+        if bit >= 0:
+            out[at + bit] = 1
+            out[other + bit] = 1
 
 
 @njit(_nrt=False)
-def _player_features(states, s, p, table, floor, items, out, at):
-    """Players' part of one view at out[at:]; p's own entries come first."""
-    for i in range(2):
-        player = p if i == 0 else 1 - p
+def _player_features(states, s, table, meta, out, at, other):
+    """Players' part of both views, player 1's at out[at:] and player 2's at out[other:]; one's own entries come first."""
+    floor, items = meta[M_FLOOR], meta[M_ITEM]
+    for player in range(2):
+        mine, theirs = (at, other) if player == 0 else (other, at)
         cell = table[FLOOR, states[s + player]]
         if cell >= 0:
-            out[at + i * floor + cell] = 1
-        out[at + 2 * floor + 4 * i + (states[s + ORIENT + player] & 3)] = 1
-        item = states[s + HELD + player]
-        if item != 0:
-            _set_item(out, at + 2 * floor + 8 + i * items, item, table, ITEM_BIT)
+            out[mine + cell] = 1
+            out[theirs + floor + cell] = 1
+        side = 2 * floor + (states[s + ORIENT + player] & 3)
+        out[mine + side] = 1
+        out[theirs + side + 4] = 1
+        held = 2 * floor + 8
+        if states[s + HELD + player] != 0:
+            _set_item(out, mine + held, theirs + held + items, states[s + HELD + player], table, ITEM_BIT)
 
 
 @njit(_nrt=False)
-def _world_features(states, s, table, meta, out, at):
-    """The part of the view that both players share, at out[at:]."""
+def _world_features(states, s, table, meta, out, at, other):
+    """The part that is the same in both views, at out[at:] and out[other:]."""
     pots, cook, pot_bits, items = meta[M_POTS], meta[M_COOK], meta[M_POT], meta[M_ITEM]
-    slot = s + POTS
+    slot, start = s + POTS, 0
     for _ in range(pots):
         contents, cooking = states[slot], states[slot + 1]
         if contents != 0:
-            _set_item(out, at, contents, table, POT_BIT)
+            _set_item(out, at + start, other + start, contents, table, POT_BIT)
             if 0 < cooking <= cook:
-                out[at + pot_bits + cooking - 1] = 1
-        at += pot_bits + cook
+                out[at + start + pot_bits + cooking - 1] = 1
+                out[other + start + pot_bits + cooking - 1] = 1
+        start += pot_bits + cook
         slot += 2
     for _ in range(meta[M_COUNTERS]):
         if states[slot] != 0:
-            _set_item(out, at, states[slot], table, ITEM_BIT)
-        at += items
+            _set_item(out, at + start, other + start, states[slot], table, ITEM_BIT)
+        start += items
         slot += 1
     if meta[M_HORIZON] - (states[s + TIME] + 256 * states[s + TIME + 1]) < URGENT_BELOW:
-        out[at] = 1
+        out[at + start] = 1
+        out[other + start] = 1
 
 
 @njit(cache=True, _nrt=False)
@@ -209,82 +218,93 @@ def encode_features(states, size, table, meta, out):
         states: (N * S,) uint8.  size: S.  table, meta: see tables.Tables.
         out: (N * 2 * F,) uint8.
     """
-    length, floor, items = meta[M_FEATURES], meta[M_FLOOR], meta[M_ITEM]
-    shared = 2 * floor + 8 + 2 * items
+    length = meta[M_FEATURES]
+    shared = 2 * meta[M_FLOOR] + 8 + 2 * meta[M_ITEM]
     for i in range(out.shape[0]):
         out[i] = 0
     at = 0
     for s in range(0, states.shape[0], size):
-        for p in range(2):
-            _player_features(states, s, p, table, floor, items, out, at)
-            _world_features(states, s, table, meta, out, at + shared)
-            at += length
+        _player_features(states, s, table, meta, out, at, at + length)
+        _world_features(states, s, table, meta, out, at + shared, at + length + shared)
+        at += 2 * length
 
 
 @njit(_nrt=False)
-def _lossless_soup(out, at, contents, cooking, table, idle):
-    """A soup in a pot (idle or not), in a hand or on a counter."""
-    start = at + (C_IN_POT if idle else C_IN_SOUP)
-    out[start] = table[SOUP_ONIONS, contents]
-    out[start + 1] = table[SOUP_TOMATOES, contents]
+def _set_both(out, at, other, value):
+    out[at] = value
+    out[other] = value
+
+
+@njit(_nrt=False)
+def _lossless_soup(out, at, other, contents, cooking, table, idle):
+    """A soup in a pot (idle or not), in a hand or on a counter, in both views."""
+    first = C_IN_POT if idle else C_IN_SOUP
+    _set_both(out, at + first, other + first, table[SOUP_ONIONS, contents])
+    _set_both(out, at + first + 1, other + first + 1, table[SOUP_TOMATOES, contents])
     if not idle:
-        out[at + C_COOK] = cooking - 1
+        _set_both(out, at + C_COOK, other + C_COOK, cooking - 1)
         if cooking == 1:
-            out[at + C_DONE] = 1
+            _set_both(out, at + C_DONE, other + C_DONE, 1)
 
 
 @njit(_nrt=False)
-def _lossless_item(out, at, item, table):
+def _lossless_item(out, at, other, item, table):
     if item >= FIRST_SOUP:
-        _lossless_soup(out, at, item, 1, table, False)
-    elif item == DISH:
-        out[at + C_DISH] = 1
-    elif item == ONION:
-        out[at + C_ONION] = 1
-    elif item == TOMATO:
-        out[at + C_TOMATO] = 1
+        _lossless_soup(out, at, other, item, 1, table, False)
+    elif item != 0:
+        channel = C_DISH if item == DISH else C_ONION if item == ONION else C_TOMATO
+        _set_both(out, at + channel, other + channel, 1)
 
 
 @njit(_nrt=False)
-def _lossless_view(states, s, p, table, meta, walls, out, at):
-    """Lossless encoding of one state for player p into out[at : at + W * H * CHANNELS], zeros so far."""
+def _lossless_players(states, s, table, out, at, other):
+    for player in range(2):
+        here = table[XFIRST, states[s + player]] * CHANNELS
+        mine, theirs = (at + here, other + here) if player == 0 else (other + here, at + here)
+        out[mine] = 1
+        out[theirs + 1] = 1
+        side = 2 + (states[s + ORIENT + player] & 3)
+        out[mine + side] = 1
+        out[theirs + side + 4] = 1
+        _lossless_item(out, mine, theirs, states[s + HELD + player], table)
+
+
+@njit(_nrt=False)
+def _lossless_world(states, s, table, meta, walls, out, at, other):
     for i in range(walls.shape[0]):
-        out[at + walls[i]] = 1
+        _set_both(out, at + walls[i], other + walls[i], 1)
     if meta[M_HORIZON] - (states[s + TIME] + 256 * states[s + TIME + 1]) < URGENT_BELOW:
-        for cell in range(meta[M_CELLS]):
-            out[at + cell * CHANNELS + C_URGENCY] = 1
-    for i in range(2):
-        player = p if i == 0 else 1 - p
-        here = at + table[XFIRST, states[s + player]] * CHANNELS
-        out[here + i] = 1
-        out[here + 2 + 4 * i + (states[s + ORIENT + player] & 3)] = 1
-        _lossless_item(out, here, states[s + HELD + player], table)
+        for cell in range(0, meta[M_CELLS] * CHANNELS, CHANNELS):
+            _set_both(out, at + cell + C_URGENCY, other + cell + C_URGENCY, 1)
     slot = s + POTS
     for i in range(meta[M_POTS]):
         contents, cooking = states[slot], states[slot + 1]
         if contents != 0:
-            _lossless_soup(out, at + table[POT_CELL, i] * CHANNELS, contents, cooking, table, cooking == 0)
+            here = table[POT_CELL, i] * CHANNELS
+            _lossless_soup(out, at + here, other + here, contents, cooking, table, cooking == 0)
         slot += 2
     for i in range(meta[M_COUNTERS]):
         if states[slot + i] != 0:
-            _lossless_item(out, at + table[COUNTER_CELL, i] * CHANNELS, states[slot + i], table)
+            here = table[COUNTER_CELL, i] * CHANNELS
+            _lossless_item(out, at + here, other + here, states[slot + i], table)
 
 
 @njit(cache=True, _nrt=False)
-def encode_lossless(states, size, players, table, meta, walls, out):
-    """overcooked_ai's lossless encoding of the first `players` players, all of `out` written.
+def encode_lossless(states, size, table, meta, walls, out):
+    """overcooked_ai's lossless encoding for both players, all of `out` written.
 
     Args:
-        states: (N * S,) uint8.  size: S.  players: 1 or 2.  table, meta, walls: see tables.Tables.
-        out: (N * players * W * H * CHANNELS,) uint8.
+        states: (N * S,) uint8.  size: S.  table, meta, walls: see tables.Tables.
+        out: (N * 2 * W * H * CHANNELS,) uint8.
     """
+    length = meta[M_CELLS] * CHANNELS
     for i in range(out.shape[0]):
         out[i] = 0
     at = 0
     for s in range(0, states.shape[0], size):
-        for p in range(players):
-            _lossless_view(states, s, p, table, meta, walls, out, at)
-            at += meta[M_CELLS] * CHANNELS
+        _lossless_players(states, s, table, out, at, at + length)
+        _lossless_world(states, s, table, meta, walls, out, at, at + length)
+        at += 2 * length
 
 
 @njit(_nrt=False)

@@ -124,7 +124,9 @@ def _from_file(layout: str) -> Layout:
     if named:
         folder = _layout_folder()
         if folder is None:
-            raise UserError("env.layout", "overcooked_ai is not installed", "pip install overcooked-ai, or give env.grid")
+            raise UserError(
+                "env.layout", "overcooked_ai is not installed", "pip install overcooked-ai, or give env.grid"
+            )
         path = folder / f"{layout}.layout"
     if path.suffix != ".layout" or not path.is_file():
         close = difflib.get_close_matches(path.stem, layout_names(), 3) if named else []
@@ -174,7 +176,12 @@ def _check_grid(layout: Layout, field: str) -> None:
 
 
 def _check_tiles(layout: Layout, field: str) -> None:
-    for mark, what in (("P", "pot"), ("OT", "ingredient dispenser"), ("D", "dish dispenser"), ("S", "serving location")):
+    for mark, what in (
+        ("P", "pot"),
+        ("OT", "ingredient dispenser"),
+        ("D", "dish dispenser"),
+        ("S", "serving location"),
+    ):
         if not any(layout.cells(one) for one in mark):
             raise UserError(field, f"has no {what}", f"add {' or '.join(mark)} where a player can reach it")
     for mark, what in TILES.items():
@@ -182,7 +189,9 @@ def _check_tiles(layout: Layout, field: str) -> None:
             beside = [layout.rows[y + dy][x + dx] for dx, dy in DIRECTIONS if _inside(layout, x + dx, y + dy)]
             part = mark == "S" and "S" in beside and layout.usable("S")  # serving areas may be more than one tile deep
             if not layout.users((x, y)) and not part:
-                raise UserError(field, f"no player can reach the {what} at column {x}, row {y}", "free a cell next to it")
+                raise UserError(
+                    field, f"no player can reach the {what} at column {x}, row {y}", "free a cell next to it"
+                )
 
 
 def _check_flow(layout: Layout, field: str) -> None:

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from popgen.envs.overcooked.kernels import DISH, FIRST_SOUP, ONION, TOMATO
 from popgen.errors import UserError
 
-NOTHING, ONION, TOMATO, DISH = 0, 1, 2, 3
-FIRST_SOUP = 4
+NOTHING = 0
 MAX_INGREDIENTS = 3
 MAX_COOK_TIME = 250  # a pot's byte also tells idle and ready
 
@@ -46,7 +46,9 @@ class Rules:
     cook_time: dict[tuple[int, int], int]
     max_ingredients: int
 
-    def pot_contents(self, onions: bool, tomatoes: bool, initial: Iterable[tuple[int, int]] = ()) -> list[tuple[int, int]]:
+    def pot_contents(
+        self, onions: bool, tomatoes: bool, initial: Iterable[tuple[int, int]] = ()
+    ) -> list[tuple[int, int]]:
         """All that pots can hold, from empty or `initial` pots, when these ingredients can be had."""
         found, front = set(initial), [(0, 0), *initial]
         while front:
@@ -135,7 +137,7 @@ def _recipes(orders: Iterable[Any], field: str) -> Iterable[tuple[int, int]]:
 
 
 def _figure(config: Mapping[str, Any], soup: tuple[int, int], named: list, fixed: str, table: str, kind: str) -> Any:
-    """One recipe's value or time; as in overcooked_ai a fixed figure or an ingredient's figure of 0 counts as absent."""
+    """One recipe's value or time; in overcooked_ai a fixed figure or an ingredient's figure of 0 counts as absent."""
     if config.get(fixed):
         return config[fixed]
     if config.get(table) and soup in named:

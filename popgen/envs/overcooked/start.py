@@ -34,7 +34,9 @@ def start_row(layout: Layout, rules: Rules) -> np.ndarray:
     try:
         _fill(row, layout, rules, given)
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise UserError("env.layout", f"start_state does not fit the grid ({error!r})", "correct or remove it") from None
+        raise UserError(
+            "env.layout", f"start_state does not fit the grid ({error!r})", "correct or remove it"
+        ) from None
     return row
 
 
@@ -81,7 +83,7 @@ def _item(thing: Mapping[str, Any] | None) -> int:
 def possible_contents(
     layout: Layout, rules: Rules, row: np.ndarray, auto: bool
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """What pots can hold, and which soups can be cooking or cooked, from the start `row` on; (onions, tomatoes) each."""
+    """What pots can hold, and which soups can cook or be cooked, from the start `row` on; (onions, tomatoes) each."""
     mixes = {code: soup for soup, code in SOUP_CODE.items()}
     end = k.POTS + 2 * len(layout.usable("P"))
     idle = {mixes[row[s]] for s in range(k.POTS, end, 2) if row[s] and not row[s + 1]}

@@ -12,7 +12,18 @@ import numpy as np
 
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked.layout import DIRECTIONS, Layout
-from popgen.envs.overcooked.rules import DISH, FIRST_SOUP, NOTHING, ONION, SOUP_CODE, SOUPS, TOMATO, Rules
+from popgen.envs.overcooked.rules import (
+    DISH,
+    FIRST_SOUP,
+    MAX_INGREDIENTS,
+    NOTHING,
+    NUM_CODES,
+    ONION,
+    SOUP_CODE,
+    SOUPS,
+    TOMATO,
+    Rules,
+)
 
 KINDS = {"X": k.COUNTER, "O": k.ONIONS, "T": k.TOMATOES, "D": k.DISHES, "P": k.POT, "S": k.SERVE}
 
@@ -72,8 +83,8 @@ def build_tables(
     ingredients = [code for mark, code in (("O", ONION), ("T", TOMATO)) if layout.usable(mark)]
     codes = np.zeros((4, 512), np.int16)
     items = [*ingredients, DISH, *(SOUP_CODE[soup] for soup in soups)]
-    item_names = _fill_bits(table, codes, k.ITEM_BIT, 0, items, items_too=True)
-    pot_names = _fill_bits(table, codes, k.POT_BIT, 1, [SOUP_CODE[soup] for soup in contents], items_too=False)
+    item_names = _fill_bits(table, codes[0], k.ITEM_BIT, items, items_too=True)
+    pot_names = _fill_bits(table, codes[1], k.POT_BIT, [SOUP_CODE[soup] for soup in contents], items_too=False)
     cook = max(1, max(rules.cook_time[soup] for soup in soups))
     floor = layout.floor
     codes[2, : len(floor)] = [_cell(layout, cell) for cell in floor]
@@ -127,30 +138,38 @@ def _fill_recipes(table: np.ndarray, rules: Rules) -> None:
             table[k.ADD_TOMATO, code] = SOUP_CODE[onions, tomatoes + 1]
 
 
-def _fill_bits(table: np.ndarray, codes: np.ndarray, row: int, inverse: int, present: list[int], *, items_too: bool) -> list[str]:
+def _tests(items_too: bool) -> list[tuple[str, list[bool]]]:
+    """Name and value per object code of every bit that may describe an object."""
+    items = (("onion", ONION), ("tomato", TOMATO), ("dish", DISH)) if items_too else ()
+    tests = [(name, [code == item for code in range(NUM_CODES)]) for name, item in items]
+    for column, ingredient in enumerate(("onions", "tomatoes")):
+        for level in range(1, MAX_INGREDIENTS + 1):
+            values = [False] * FIRST_SOUP + [soup[column] >= level for soup in SOUPS]
+            tests.append((f"soup_{ingredient}>={level}", values))
+    return tests
+
+
+def _fill_bits(table: np.ndarray, inverse: np.ndarray, row: int, present: list[int], *, items_too: bool) -> list[str]:
     """Choose the bits that tell the objects apart and tabulate them; returns the bits' names.
 
     Soups are thermometers of onions and of tomatoes; a bit that is always 0, or always equal to an earlier one,
     is left out (with only one possible soup, one bit says it is there).
     """
-    tests = [(f"{['onion', 'tomato', 'dish'][code - 1]}", lambda c, code=code: c == code) for code in (ONION, TOMATO, DISH)]
-    tests = tests if items_too else []
-    for column, ingredient in ((0, "onions"), (1, "tomatoes")):
-        for level in (1, 2, 3):
-            tests.append((f"soup_{ingredient}>={level}", lambda c, i=column, n=level: c >= FIRST_SOUP and SOUPS[c - FIRST_SOUP][i] >= n))
     kept: dict[tuple[bool, ...], str] = {}
-    for name, test in tests:
-        pattern = tuple(test(code) for code in present)
+    for name, values in _tests(items_too):
+        pattern = tuple(values[code] for code in present)
         if any(pattern) and pattern not in kept:
             kept[pattern] = name
     for i, code in enumerate(present):
         bits = [bit for bit, pattern in enumerate(kept) if pattern[i]]
         table[row : row + 3, code] = (bits + bits[-1:] * 3)[:3]  # repeats are harmless: the kernel only sets bits
-        codes[inverse, sum(1 << bit for bit in bits)] = code
+        inverse[sum(1 << bit for bit in bits)] = code
     return list(kept.values())
 
 
-def _names(floor: list, items: list[str], pots: list, pot_bits: list[str], cook: int, counters: list) -> tuple[str, ...]:
+def _names(
+    floor: list, items: list[str], pots: list, pot_bits: list[str], cook: int, counters: list
+) -> tuple[str, ...]:
     who, sides = ("self", "other"), ("north", "south", "east", "west")
     names = [f"{w}_at_{x},{y}" for w in who for x, y in floor]
     names += [f"{w}_faces_{side}" for w in who for side in sides]

@@ -1,0 +1,79 @@
+"""What a population holds, for people and for machines."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+
+from popgen.population.manifest import folder_name
+from popgen.population.store import Population
+from popgen.types import Kind
+
+
+def describe(population: Population) -> dict[str, Any]:
+    """A JSON-able account of a population.
+
+    Keys: `path`; `manifest`, as in the file; `bytes`, size of all members' files; `steps`, environment steps by kind,
+    and `total_steps`, over all members; `members`, each as in its member.json and with `total_steps`, `bytes`
+    (of its folder) and `parameters` (numbers in policy.safetensors).
+    """
+    members = [_describe_member(population, member) for member in range(1, len(population) + 1)]
+    kinds = step_kinds(population)
+    return {
+        "path": str(population.path),
+        "manifest": population.manifest.model_dump(mode="json"),
+        "bytes": sum(member["bytes"] for member in members),
+        "steps": {kind: sum(member["steps"].get(kind, 0) for member in members) for kind in kinds},
+        "total_steps": sum(member["total_steps"] for member in members),
+        "members": members,
+    }
+
+
+def _describe_member(population: Population, member: int) -> dict[str, Any]:
+    info = population.info(member)
+    folder = population.path / folder_name(member)
+    return {
+        **info.model_dump(mode="json"),
+        "total_steps": info.total_steps,
+        "bytes": sum(path.stat().st_size for path in folder.iterdir() if path.is_file()),
+        "parameters": sum(array.size for array in population[member].weights().values()),
+    }
+
+
+def step_kinds(population: Population) -> list[str]:
+    """Kinds of environment steps that some member used, in the order of `Kind`."""
+    used = {kind for info in population.members for kind in info.steps}
+    return [str(kind) for kind in Kind if str(kind) in used]
+
+
+def render(population: Population) -> Group:
+    """The account as text for the terminal; print it with a rich console."""
+    told = describe(population)
+    info, manifest = population.env_info, population.manifest
+    facts = Table.grid(padding=(0, 2))
+    params = ", ".join(f"{name}={value}" for name, value in info.params.items() if name != "grid")
+    for name, value in (
+        ("population", told["path"]),
+        ("environment", f"{info.name} ({params})" if params else info.name),
+        ("rules", info.fingerprint[:12]),
+        ("method", f"{manifest.method}, seed {manifest.seed}, config {manifest.config_digest[:12]}"),
+        ("members", f"{len(population)}, {told['bytes'] / 2**20:.1f} MiB, {told['total_steps']:,} environment steps"),
+        ("written by", ", ".join(f"{name} {value}" for name, value in manifest.versions.model_dump().items())),
+    ):
+        facts.add_row(name, value)
+    return Group(facts, "", _members_table(told, step_kinds(population)))
+
+
+def _members_table(told: dict[str, Any], kinds: list[str]) -> Table:
+    table = Table("member", "policy")
+    for name in ("seed", "parameters", "MiB", *(f"{kind} steps" for kind in kinds), "all steps"):
+        table.add_column(name, justify="right")
+    for member in told["members"]:
+        steps = [f"{member['steps'].get(kind, 0):,}" for kind in kinds]
+        size = (f"{member['parameters']:,}", f"{member['bytes'] / 2**20:.1f}")
+        table.add_row(
+            str(member["id"]), member["kind"], str(member["seed"]), *size, *steps, f"{member['total_steps']:,}"
+        )
+    return table

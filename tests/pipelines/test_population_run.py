@@ -1,0 +1,235 @@
+"""Whole runs at `scale=smoke` on a local Ray of two cores: member by member, twice, interrupted, continued."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ray
+
+from actors.sampler import Collected
+from pipelines import population as pipeline
+from pipelines.books import Books
+from pipelines.population import run_population
+from popgen.cli import compose
+from popgen.config import RunConfig
+from popgen.data.checkpoint import load_state
+from popgen.data.ledger import Ledger
+from popgen.data.replay import KIND_CODE
+from popgen.errors import UserError
+from popgen.population import Population, load_population
+from popgen.progress import NullReporter
+from popgen.types import Kind
+
+HORIZON = 40
+
+
+@dataclass
+class Run:
+    """A finished run: what it returned, and what its samplers said they stepped."""
+
+    result: dict[str, Any]
+    collected: list[tuple[int, Collected]]
+
+    @property
+    def dir(self) -> Path:
+        return Path(self.result["run_dir"])
+
+    @property
+    def population(self) -> Population:
+        return load_population(self.result["population"])
+
+    def ledger(self) -> list[tuple[Any, ...]]:
+        """All entries but for the run's name and the number of the attempt."""
+        entries = Ledger(self.dir / "ledger.jsonl")
+        return [
+            (e.member, e.kind, e.sampler.partition(".")[0], e.sequence, e.steps, e.episodes, e.score) for e in entries
+        ]
+
+
+def sha256s(run: Run) -> list[str]:
+    return [info.policy_sha256 for info in run.population.members]
+
+
+class Interrupted(RuntimeError):
+    """Injected after member 1 is complete."""
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[None]:
+    """A Ray of this module's own; its sockets need a short path."""
+    folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")
+    ray.init(
+        address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", _temp_dir=folder
+    )
+    yield
+    ray.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+def launch(root: Path, name: str, *overrides: str) -> Run:
+    """Run `scale=smoke` with two members and short episodes, listening to what the samplers say."""
+    base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
+    config = RunConfig.parse(compose([*base, f"run.root={root}", f"run.id={name}", *overrides]))
+    collected: list[tuple[int, Collected]] = []
+
+    class Listening(Books):
+        def record(self, member: int, said: Collected) -> None:
+            collected.append((member, said))
+            super().record(member, said)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "Books", Listening)
+        return Run(run_population(config, reporter=NullReporter()), collected)
+
+
+@pytest.fixture(scope="module")
+def whole(cluster: None, root: Path) -> Run:
+    return launch(root, "whole")
+
+
+@pytest.fixture(scope="module")
+def resumed(cluster: None, root: Path) -> Run:
+    """The same seed once more, interrupted after member 1 and started again under the same id."""
+
+    def stop(*_: Any) -> None:
+        raise Interrupted
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline.Driver, "train_later", stop)
+        with pytest.raises(Interrupted):
+            launch(root, "resumed")
+    assert len(load_population(root / "resumed" / "population")) == 1
+    return launch(root, "resumed")
+
+
+@pytest.fixture(scope="module")
+def continued(whole: Run, root: Path) -> Run:
+    """Member 2 trained in a new run that continues from member 1 of another."""
+    return launch(root, "continued", f"population.init_from={whole.dir}", "population.init_members=1")
+
+
+@pytest.fixture(scope="module")
+def overlapped(cluster: None, root: Path) -> Run:
+    return launch(root, "overlapped", "run.schedule=async", "population.size=1")
+
+
+def check_ledger(run: Run) -> None:
+    """The ledger holds what the samplers counted, nothing else, and what the buffers hold."""
+    said: Counter[tuple[int, str]] = Counter()
+    for member, collected in run.collected:
+        for kind, _, _, steps in collected.counts:
+            said[member, str(kind)] += steps
+    table = Ledger(run.dir / "ledger.jsonl").table()
+    assert table == run.result["ledger"]
+    counted = {
+        (int(member), kind): steps
+        for member, row in table.items()
+        if member != "total"
+        for kind, steps in row.items()
+        if kind not in ("total", "evaluation")
+    }
+    assert counted == dict(said) and min(counted.values()) > 0
+    held: Counter[tuple[int, str]] = Counter()
+    last = sorted((run.dir / "checkpoints").iterdir())[-1]
+    for name in ("replay_sp", "replay_xp"):
+        arrays = load_state(last)[name]["replay"]["arrays"]
+        assert not arrays["terminal"].any()  # every row is a step, none an arrival
+        for kind, code in KIND_CODE.items():
+            for owner in (1, 2):
+                rows = int(((arrays["kind"] == code) & (arrays["owner"] == owner)).sum())
+                if rows:
+                    held[owner, str(kind)] += rows
+                    assert (name == "replay_xp") == (kind is Kind.XP)
+    assert dict(held) == counted
+
+
+def test_every_step_is_in_the_ledger_and_in_the_buffers(whole: Run) -> None:
+    check_ledger(whole)
+    table = whole.result["ledger"]
+    config = RunConfig.parse(json.loads((whole.dir / "config.json").read_text()))
+    assert table["1"]["random"] == config.phase1.prefill_steps
+    assert table["1"]["SP"] + table["1"]["random"] >= config.phase1.max_steps
+    assert table["2"]["SP"] == config.phase2.rounds * config.phase2.episodes_sp * HORIZON
+    assert table["2"]["XP"] == config.phase2.rounds * config.phase2.episodes_xp * HORIZON
+    assert table["2"]["evaluation"] == whole.result["evaluation"]["steps"] > 0
+    assert table["total"]["total"] == sum(sum(steps for *_, steps, _, _ in [entry]) for entry in whole.ledger())
+
+
+def test_the_population_holds_both_members_and_their_steps(whole: Run) -> None:
+    population, table = whole.population, whole.result["ledger"]
+    assert len(population) == whole.result["members"] == 2
+    for member, info in enumerate(population.members, start=1):
+        row = {kind: steps for kind, steps in table[str(member)].items() if kind not in ("total", "evaluation")}
+        assert info.steps == row and info.seed == 3000 + member
+        training = population.training(member)
+        assert training is not None
+        critics = {name.split(".")[1] for name in training if name.startswith("critics.")}
+        assert critics == {str(k) for k in range(member)}  # self-play, and one per predecessor
+        assert any(name.startswith("model.decoders.") for name in training)
+        assert {"sp", "xp", "seconds", "world_model"} <= info.extra.keys()
+    assert np.shape(whole.result["matrix"]["mean"]) == (2, 2)
+    assert all(Path(path).exists() for path in whole.result["files"].values())
+
+
+def test_episodes_are_those_of_the_steps(whole: Run) -> None:
+    ledger = Ledger(whole.dir / "ledger.jsonl")
+    for kind in (Kind.SP, Kind.XP):
+        assert ledger.episodes(2, kind) * HORIZON == ledger.steps(2, kind)
+    pairs = Counter(members for member, said in whole.collected for kind, members, *_ in said.counts if kind is Kind.XP)
+    assert set(pairs) == {(1, 2), (2, 1)}
+
+
+def test_metrics_tell_what_training_did(whole: Run) -> None:
+    rows = [json.loads(line) for line in (whole.dir / "metrics.jsonl").read_text().splitlines()]
+    for member, wanted in (
+        (1, {"model/loss_observation", "agent/entropy", "agent/return_scale", "real_reward_sp", "final_sp"}),
+        (2, {"agent/imagined_reward_sp", "agent/imagined_reward_xp", "real_sp", "real_xp_max", "final_xp"}),
+    ):
+        names = set().union(*(row.keys() for row in rows if row["member"] == member))
+        assert wanted <= names and {"event_recall_step1", "event_precision_step4", "exact_posterior"} <= names
+
+
+def test_the_same_seed_gives_the_same_ledger_and_the_same_weights_even_when_interrupted(whole: Run, resumed: Run) -> None:
+    assert sha256s(resumed) == sha256s(whole) and len(set(sha256s(whole))) == 2
+    assert resumed.ledger() == whole.ledger()
+
+
+def test_a_resumed_run_trains_only_what_was_missing(resumed: Run) -> None:
+    assert {member for member, _ in resumed.collected} == {2}
+    assert len((resumed.dir / "attempts.txt").read_text().splitlines()) == 2
+    ledger = Ledger(resumed.dir / "ledger.jsonl")
+    assert {entry.sampler for entry in ledger if entry.member == 1} == {"sampler0.1"}
+    assert {entry.sampler for entry in ledger if entry.member == 2} == {"sampler0.2", "evaluation.2"}
+
+
+def test_a_run_id_belongs_to_one_configuration(resumed: Run, root: Path) -> None:
+    with pytest.raises(UserError, match="resumed exists with another config"):
+        launch(root, "resumed", "agent.lambda_xp=0.5")
+
+
+def test_a_run_can_go_on_from_a_member_of_another(whole: Run, continued: Run) -> None:
+    assert sha256s(continued) == sha256s(whole)
+    assert {member for member, _ in continued.collected} == {2}
+    # Member 1's steps were another run's: they stand in its record, not in this ledger.
+    assert "1" not in continued.result["ledger"]
+    assert continued.population.info(1).steps == whole.population.info(1).steps
+    assert continued.result["ledger"]["2"] == whole.result["ledger"]["2"]
+
+
+def test_overlapping_work_is_counted_exactly(overlapped: Run) -> None:
+    check_ledger(overlapped)
+    assert len(overlapped.population) == 1
