@@ -15,6 +15,7 @@ from actors.common import build_env
 from actors.sampler import Collected, PolicyParts
 from pipelines.books import Books
 from pipelines.crew import Crew, start_ray
+from pipelines.report import write_run_figures
 from pipelines.rounds import run_rounds
 from popgen.config import RunConfig
 from popgen.data.checkpoint import load_state, save_state
@@ -317,6 +318,10 @@ class Driver:
         size = len(books.population)
         episodes = result.episodes * len(result.pairings)
         books.record_steps(size, Kind.EVALUATION, f"evaluation.{books.attempt}", 0, result.steps, episodes)
+        steps = [sum(books.training_steps(member).values()) for member in range(1, size + 1)]
+        files |= write_run_figures(
+            books.dir, books.dir / "report", steps, unit=self.spec.score_name, title=self.spec.name
+        )
         for file in files.values():
             books.tracker.log_artifact(file, "report")
         figures = {"sp": result.sp.mean, "xp": result.xp.mean}

@@ -132,10 +132,12 @@ def _print_run(result: Mapping[str, Any]) -> None:
         cells = ({"mean": mean, "standard_error": error} for mean, error in zip(means, errors, strict=True))
         table.add_row(str(member), *map(_figure_text, cells))
     _print_table(table)
-    print(f"SP mean {_figure_text(evaluation['sp'])}   XP mean {_figure_text(evaluation['xp'])}")
-    rows = result["ledger"].items()
-    steps = ", ".join(f"{'all' if who == 'total' else f'member {who}'} {row['total']:,}" for who, row in rows)
-    print(f"environment steps: {steps}   time: {result['seconds'] / 60:.1f} minutes")
+    beside = "".join(f"   beside {who} {_figure_text(row['both'])}" for who, row in evaluation["beside"].items())
+    print(f"SP mean {_figure_text(evaluation['sp'])}   XP mean {_figure_text(evaluation['xp'])}{beside}")
+    for who, row in result["ledger"].items():
+        kinds = ", ".join(f"{kind} {steps:,}" for kind, steps in row.items() if steps and kind != "total")
+        print(f"environment steps, {'all' if who == 'total' else f'member {who}'}: {kinds}")
+    print(f"time: {result['seconds'] / 60:.1f} minutes")
     print(f"population: {result['population']}   ledger, checkpoints and reports: {result['run_dir']}")
 
 

@@ -117,7 +117,8 @@ class AgentConfig(Schema):
     slow_critic: Fraction = 0.98
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
     lambda_xp: Weight = 0.5
-    lambda_warmup: NonNegative = 0
+    lambda_start: Weight = 0.25
+    lambda_ramp: NonNegative = 1000
     sp_from_xp: Fraction = 0.5
     xp_starts: Literal["partner", "any"] = "partner"
     partner: Literal["max_window", "max_buffer"] = "max_window"

@@ -74,10 +74,10 @@ def crossplay_heat_map(result: CrossPlayResult, paths: Sequence[str | Path]) -> 
 
 
 def _heat(axes: Axes, mean: np.ndarray, error: np.ndarray) -> matplotlib.cm.ScalarMappable:
-    colours = matplotlib.colormaps["cividis"].copy()
-    colours.set_bad("white")
+    colours = matplotlib.colormaps["cividis"]
     low = min(0.0, float(np.nanmin(mean)))
     high = max(float(np.nanmax(mean)), low + 1e-9)
+    axes.set_facecolor("white")  # shows where nothing was played
     image = axes.imshow(np.ma.masked_invalid(mean), cmap=colours, vmin=low, vmax=high, aspect="auto")
     for (row, column), value in np.ndenumerate(mean):
         if math.isnan(value):

@@ -12,7 +12,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"silu": nn.SiLU, "leaky_relu": nn.Lea
 
 
 def linear(inputs: int, outputs: int, *, scale: float = 1.0) -> nn.Linear:
-    """Linear layer with zero bias and normal weights of variance scale / fan-average, cut at two deviations (DreamerV3)."""
+    """Linear layer, zero bias, normal weights of variance scale / fan-average cut at two deviations (DreamerV3)."""
     layer = nn.Linear(inputs, outputs)
     if scale == 0.0:
         nn.init.zeros_(layer.weight)

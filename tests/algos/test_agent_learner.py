@@ -131,14 +131,16 @@ def test_cross_play_moves_the_actor_by_the_lambda_times_the_reinforce_gradient()
         torch.testing.assert_close(mine, parameter.grad, atol=1e-6, rtol=1e-4)
 
 
-def test_lambda_is_warmed_up() -> None:
+def test_lambda_rises_from_its_start_to_its_end() -> None:
     scores = []
-    for updates in (0, 4, 9, 50):
-        learner = make_learner(lambda_xp=0.5, lambda_warmup=10, entropy=0.0)
+    for updates in (0, 5, 10, 50):
+        learner = make_learner(lambda_xp=0.5, lambda_start=0.1, lambda_ramp=10, entropy=0.0)
         learner.updates = updates
-        loss, _, figures = learner._cross_play_losses(trajectories(ROWS, lambda a: good_and_bad(own_action(a))), 1, SEATS)
+        loss, _, figures = learner._cross_play_losses(
+            trajectories(ROWS, lambda a: good_and_bad(own_action(a))), 1, SEATS
+        )
         scores.append(figures["advantage_xp"])
-    assert [round(score / scores[-1], 4) for score in scores] == [0.1, 0.5, 1.0, 1.0]
+    assert [round(score / scores[-1], 4) for score in scores] == [0.2, 0.6, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("key", [SELF, 1, 2])

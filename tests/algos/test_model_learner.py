@@ -138,7 +138,9 @@ def test_the_predecessor_term_is_of_cross_play_rows_and_of_the_right_member(read
     )
     torch.testing.assert_close(terms["predecessors"], expected)
     terms["predecessors"].backward()
-    trained = {name.split(".")[0] for name, p in learner.model.named_parameters() if p.grad is not None and p.grad.any()}
+    trained = {
+        name.split(".")[0] for name, p in learner.model.named_parameters() if p.grad is not None and p.grad.any()
+    }
     assert trained == {"filter"}
 
 
@@ -254,7 +256,9 @@ def test_report_goes_on_open_loop_with_the_real_actions(monkeypatch: pytest.Monk
         return observe(obs, actions, is_first, generator)
 
     monkeypatch.setattr(model, "observe", spied_observe)
-    monkeypatch.setattr(model, "step", lambda latent, actions, generator: (played.append(actions), step(latent, actions))[1])
+    monkeypatch.setattr(
+        model, "step", lambda latent, actions, generator: (played.append(actions), step(latent, actions))[1]
+    )
     model_report(learner, windows, context)
     assert observed == [(context, context)]
     # actions[t] led to state t.

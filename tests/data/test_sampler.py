@@ -35,7 +35,9 @@ class Scripted:
 
 def narrow_rendezvous(num_envs: int) -> BatchedEnv:
     """A square so small that random players leave it about as often as their time runs out."""
-    return make_env("rendezvous/mppmr", num_envs, seed=1, bounds=0.8, landmark_distance=0.5, horizon=15, start_noise=0.2)
+    return make_env(
+        "rendezvous/mppmr", num_envs, seed=1, bounds=0.8, landmark_distance=0.5, horizon=15, start_noise=0.2
+    )
 
 
 def random_sampler(env: BatchedEnv, teams: list[Team] = TEAMS, **options: Any) -> Sampler:
@@ -51,7 +53,9 @@ def joined(collected: list[list[Segment]], team: int) -> Segment:
     return Segment(parts[0].kind, parts[0].members, **columns, sampler="", sequence=0)
 
 
-@pytest.mark.parametrize("make", [lambda n: kitchen(n, horizon=13), narrow_rendezvous], ids=["overcooked", "rendezvous"])
+@pytest.mark.parametrize(
+    "make", [lambda n: kitchen(n, horizon=13), narrow_rendezvous], ids=["overcooked", "rendezvous"]
+)
 def test_segments_replay_exactly_and_episodes_go_on_over_calls(make: Any) -> None:
     env = make(COUNT)
     sampler = random_sampler(env)
@@ -103,7 +107,7 @@ def test_policies_see_the_state_the_last_actions_and_the_beginnings() -> None:
 
 
 def recount(env: BatchedEnv, segment: Segment, team: Team, partial: np.ndarray) -> list[tuple[Any, ...]]:
-    """Whole episodes of a segment in the order in which they ended; those that run at its start count unless `partial`."""
+    """Whole episodes of a segment, column by column; the first of a column does not count where `partial`."""
     found = []
     weights = np.array(env.spec.event_weights)
     for column in range(segment.reward.shape[1]):
@@ -113,7 +117,9 @@ def recount(env: BatchedEnv, segment: Segment, team: Team, partial: np.ndarray) 
             counts += segment.events[t, column]
             if segment.terminated[t, column] or segment.truncated[t, column]:
                 if not skip:
-                    found.append((t, column, team.members, round(score, 3), float((counts * weights).sum()), counts.tolist()))
+                    found.append(
+                        (t, column, team.members, round(score, 3), float((counts * weights).sum()), counts.tolist())
+                    )
                 score, counts, skip = 0.0, np.zeros_like(counts), False
     return found
 
@@ -123,7 +129,9 @@ def shown(episodes: list[Episode]) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("stagger", [False, True])
-@pytest.mark.parametrize("make", [lambda n: kitchen(n, horizon=60), narrow_rendezvous], ids=["overcooked", "rendezvous"])
+@pytest.mark.parametrize(
+    "make", [lambda n: kitchen(n, horizon=60), narrow_rendezvous], ids=["overcooked", "rendezvous"]
+)
 def test_episodes_are_counted_whole(make: Any, stagger: bool) -> None:
     env = make(COUNT)
     sampler = random_sampler(env, stagger=stagger)
@@ -143,7 +151,9 @@ def test_episodes_are_counted_whole(make: Any, stagger: bool) -> None:
 
 
 def test_stagger_spreads_the_first_ends_over_the_horizon() -> None:
-    sampler = random_sampler(kitchen(4, horizon=20), [Team(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), 4)], stagger=True)
+    sampler = random_sampler(
+        kitchen(4, horizon=20), [Team(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), 4)], stagger=True
+    )
     (segment,) = sampler.collect(20)[0]
     assert [np.flatnonzero(segment.truncated[:, i]).tolist() for i in range(4)] == [[19], [14], [9], [4]]
 

@@ -58,7 +58,8 @@ def test_simulate_is_step_for_any_leading_shape(name):
         stepped, pure = getattr(batch, field.name), getattr(simulated, field.name)
         assert pure.shape[:2] == (2, BATCH // 2) and np.array_equal(pure.reshape(stepped.shape), stepped), field.name
     single, one = env.simulate(before[0], actions[0])
-    assert np.array_equal(single, following[0, 0]) and one.reward.shape == () and one.events.shape == batch.events[0].shape
+    assert np.array_equal(single, following[0, 0])
+    assert one.reward.shape == () and one.events.shape == batch.events[0].shape
     for wrong in (actions[:1], actions[0] + env.spec.num_actions):
         with pytest.raises(ValueError):
             env.simulate(before[0], wrong)

@@ -25,7 +25,8 @@ def test_mlp_layers() -> None:
     assert [type(part) for part in net] == kinds
     assert [tuple(part.weight.shape) for part in net if isinstance(part, nn.Linear)] == [(7, 3), (7, 7), (2, 7)]
     assert not net(torch.randn(4, 3)).any()
-    assert [type(part) for part in mlp(3, None, units=7, layers=1, activation="silu", norm=False)] == [nn.Linear, nn.SiLU]
+    bare = mlp(3, None, units=7, layers=1, activation="silu", norm=False)
+    assert [type(part) for part in bare] == [nn.Linear, nn.SiLU]
 
 
 def test_gru_by_hand() -> None:

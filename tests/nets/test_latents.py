@@ -36,6 +36,15 @@ def test_groups_are_drawn_independently() -> None:
     assert float(both.mean()) == pytest.approx(0.25, abs=4 * math.sqrt(0.25 * 0.75 / 20_000))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_mode_is_the_likeliest_class_and_the_first_of_equals(dtype: torch.dtype) -> None:
+    probs = torch.tensor([[0.2, 0.25, 0.4, 0.0], [0.5, 0.25, 0.2, 0.0], [0.3, 0.25, 0.4, 1.0], [0.0, 0.25, 0.0, 0.0]])
+    mode = latents.mode_one_hot(probs.to(dtype).requires_grad_())
+    assert mode.argmax(0).tolist() == [1, 0, 0, 2] and (mode.sum(0) == 1).all() and not mode.requires_grad
+    many = random_probs(50, 8, 6).to(dtype)
+    assert torch.equal(latents.mode_one_hot(many).argmax(-2), many.argmax(-2))
+
+
 def test_an_impossible_class_is_never_drawn() -> None:
     probs = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0]).reshape(5, 1).expand(5000, 5, 1)
     counts = latents.sample_one_hot(probs, torch.Generator().manual_seed(3)).sum((0, 2))

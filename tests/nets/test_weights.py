@@ -82,4 +82,6 @@ def test_an_optimiser_goes_on_where_it_was() -> None:
     w.load_optimiser_state(again, w.optimiser_state(optimiser))
     step(first, optimiser, 7)
     step(second, again, 7)
-    assert all(np.array_equal(a, b) for a, b in zip(w.weights_of(first).values(), w.weights_of(second).values(), strict=True))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(w.weights_of(first).values(), w.weights_of(second).values(), strict=True)
+    )

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from popgen.config import RunConfig
 from popgen.data.checkpoint import load_state
 from popgen.data.ledger import Ledger
 from popgen.data.replay import KIND_CODE
+from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.population import Population, load_population
 from popgen.progress import NullReporter
@@ -48,11 +50,9 @@ class Run:
         return load_population(self.result["population"])
 
     def ledger(self) -> list[tuple[Any, ...]]:
-        """All entries but for the run's name and the number of the attempt."""
+        """All entries, but for the run's name and what tells attempts apart: the key's sampler and sequence."""
         entries = Ledger(self.dir / "ledger.jsonl")
-        return [
-            (e.member, e.kind, e.sampler.partition(".")[0], e.sequence, e.steps, e.episodes, e.score) for e in entries
-        ]
+        return [(e.member, e.kind, e.sampler.partition(".")[0], e.steps, e.episodes, e.score) for e in entries]
 
 
 def sha256s(run: Run) -> list[str]:
@@ -68,7 +68,12 @@ def cluster() -> Iterator[None]:
     """A Ray of this module's own; its sockets need a short path."""
     folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")
     ray.init(
-        address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", _temp_dir=folder
+        address="local",
+        num_cpus=2,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level="ERROR",
+        _temp_dir=folder,
     )
     yield
     ray.shutdown()
@@ -80,10 +85,15 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("runs")
 
 
-def launch(root: Path, name: str, *overrides: str) -> Run:
-    """Run `scale=smoke` with two members and short episodes, listening to what the samplers say."""
+def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
+    """`scale=smoke` with two members and short episodes."""
     base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
-    config = RunConfig.parse(compose([*base, f"run.root={root}", f"run.id={name}", *overrides]))
+    return RunConfig.parse(compose([*base, f"run.root={root}", f"run.id={name}", *overrides]))
+
+
+def launch(root: Path, name: str, *overrides: str) -> Run:
+    """Run it, listening to what the samplers say."""
+    config = smoke(root, name, *overrides)
     collected: list[tuple[int, Collected]] = []
 
     class Listening(Books):
@@ -165,8 +175,8 @@ def test_every_step_is_in_the_ledger_and_in_the_buffers(whole: Run) -> None:
     assert table["1"]["SP"] + table["1"]["random"] >= config.phase1.max_steps
     assert table["2"]["SP"] == config.phase2.rounds * config.phase2.episodes_sp * HORIZON
     assert table["2"]["XP"] == config.phase2.rounds * config.phase2.episodes_xp * HORIZON
-    assert table["2"]["evaluation"] == whole.result["evaluation"]["steps"] > 0
-    assert table["total"]["total"] == sum(sum(steps for *_, steps, _, _ in [entry]) for entry in whole.ledger())
+    assert table["2"]["evaluation"] == whole.result["evaluation"]["steps"]["evaluation"] > 0
+    assert table["total"]["total"] == sum(steps for *_, steps, _, _ in whole.ledger())
 
 
 def test_the_population_holds_both_members_and_their_steps(whole: Run) -> None:
@@ -203,7 +213,9 @@ def test_metrics_tell_what_training_did(whole: Run) -> None:
         assert wanted <= names and {"event_recall_step1", "event_precision_step4", "exact_posterior"} <= names
 
 
-def test_the_same_seed_gives_the_same_ledger_and_the_same_weights_even_when_interrupted(whole: Run, resumed: Run) -> None:
+def test_the_same_seed_gives_the_same_ledger_and_the_same_weights_even_when_interrupted(
+    whole: Run, resumed: Run
+) -> None:
     assert sha256s(resumed) == sha256s(whole) and len(set(sha256s(whole))) == 2
     assert resumed.ledger() == whole.ledger()
 
@@ -218,7 +230,7 @@ def test_a_resumed_run_trains_only_what_was_missing(resumed: Run) -> None:
 
 def test_a_run_id_belongs_to_one_configuration(resumed: Run, root: Path) -> None:
     with pytest.raises(UserError, match="resumed exists with another config"):
-        launch(root, "resumed", "agent.lambda_xp=0.5")
+        launch(root, "resumed", "agent.lambda_xp=0.125")
 
 
 def test_a_run_can_go_on_from_a_member_of_another(whole: Run, continued: Run) -> None:
@@ -228,6 +240,34 @@ def test_a_run_can_go_on_from_a_member_of_another(whole: Run, continued: Run) ->
     assert "1" not in continued.result["ledger"]
     assert continued.population.info(1).steps == whole.population.info(1).steps
     assert continued.result["ledger"]["2"] == whole.result["ledger"]["2"]
+
+
+def test_a_run_that_goes_on_from_another_can_be_interrupted_before_its_first_own_member(
+    whole: Run, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until there is a checkpoint of its own, the other run's counts."""
+    loaded: list[Any] = []
+    actor = SimpleNamespace(load_state=SimpleNamespace(remote=loaded.append))
+    crew = SimpleNamespace(replay_sp=actor, replay_xp=actor, model=actor)
+    monkeypatch.setattr(pipeline.Crew, "hire", lambda config, attempt: crew)
+    config = smoke(root, "early", f"population.init_from={whole.dir}", "population.init_members=1")
+    for attempt in (1, 2):
+        loaded.clear()
+        books = Books(config, whole.population.spec)
+        driver = pipeline.Driver(config, whole.population.spec, books, NullReporter())
+        with monkeypatch.context() as patch:
+            patch.setattr(ray, "get", lambda references: references)
+            assert driver._resume() == 2
+        assert books.attempt == attempt and len(books.population) == 1 and len(loaded) == 3
+        assert driver.members.keys() == {1}
+
+
+@pytest.mark.parametrize(("steps", "rounds"), [("null", 7), ("1000000", 7), ("800", 5), ("799", 4), ("1", 1)])
+def test_rounds_of_a_later_member_end_with_its_steps(root: Path, steps: str, rounds: int) -> None:
+    config = smoke(root, "unused", "phase2.rounds=7", f"phase2.max_steps={steps}")
+    driver = pipeline.Driver.__new__(pipeline.Driver)
+    driver.config, driver.spec = config, make_env(config.env.name, 1, **config.env.params).spec
+    assert driver._rounds() == rounds  # (2 + 2) episodes of 40 steps each
 
 
 def test_overlapping_work_is_counted_exactly(overlapped: Run) -> None:

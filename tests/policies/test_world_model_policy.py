@@ -46,7 +46,9 @@ def test_actions_are_a_function_of_seed_and_observations() -> None:
 
 def test_a_saved_and_loaded_policy_acts_identically(tmp_path: Path) -> None:
     policy = make_policy()
-    PopulationWriter(tmp_path, SPEC, method="xpm_wm", config_digest="0" * 64, seed=0).add_member(policy, seed=0, steps={})
+    PopulationWriter(tmp_path, SPEC, method="xpm_wm", config_digest="0" * 64, seed=0).add_member(
+        policy, seed=0, steps={}
+    )
     loaded = load_population(tmp_path)[1]
     assert isinstance(loaded, WorldModelPolicy) and loaded.config() == policy.config()
     assert np.array_equal(play(loaded), play(policy)) and not np.array_equal(play(make_policy(1)), play(policy))

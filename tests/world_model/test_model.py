@@ -21,7 +21,9 @@ def make_model(config: WorldModelConfig = MODEL, seed: int = 0) -> WorldModel:
 def window(count: int, length: int, seed: int = 0, view: str = "features") -> tuple[Tensor, Tensor, Tensor]:
     """obs, actions and is_first, time first, of random play."""
     given = random_windows(count, length, view=view, seed=seed)
-    return tuple(torch.from_numpy(np.ascontiguousarray(x.swapaxes(0, 1))) for x in (given.obs, given.actions, given.is_first))
+    return tuple(
+        torch.from_numpy(np.ascontiguousarray(x.swapaxes(0, 1))) for x in (given.obs, given.actions, given.is_first)
+    )
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -140,7 +142,11 @@ def test_output_biases_start_at_the_means_of_the_data() -> None:
     obs_mean = torch.linspace(0.0, 1.0, 2 * size).reshape(2, size)
     event_mean = torch.linspace(0.001, 0.2, 2 * SPEC.num_events)
     with torch.no_grad():
-        for layer in (*(decoder.trunk[-1] for decoder in model.decoders), model.event_head[-1], model.continue_head[-1]):
+        for layer in (
+            *(decoder.trunk[-1] for decoder in model.decoders),
+            model.event_head[-1],
+            model.continue_head[-1],
+        ):
             layer.weight.zero_()
     model.set_output_biases(obs_mean, event_mean)
     wanted = obs_mean.clamp(1e-3, 1 - 1e-3)

@@ -133,6 +133,15 @@ class AgentLearner:
         z = from_indices(torch.from_numpy(starts.z[rows]), self.model_config.classes).flatten(-2)
         return Latent(torch.from_numpy(starts.h[rows]).to(self.dtype), z.to(self.dtype))
 
+    def lambda_now(self) -> float:
+        """lambda_XP of this update: from `lambda_start` to `lambda_xp` over `lambda_ramp` updates.
+
+        Cross-play pressure must be there from the first update, or the member settles on its predecessor's
+        convention; at full strength from the start it keeps self-play from starting at all.
+        """
+        start, end, ramp = self.config.lambda_start, self.config.lambda_xp, self.config.lambda_ramp
+        return end if not ramp else start + (end - start) * min(1.0, self.updates / ramp)
+
     def _imagine(self, partner: int | None) -> tuple[Imagined, Tensor]:
         """Self-play rows and, after them, cross-play rows in one batch; the agent's seat in the latter."""
         if self.starts is None:
@@ -203,7 +212,7 @@ class AgentLearner:
         steps, batch = imagined.reward.shape
         latent, seat = imagined.latent[:-1], seats.expand(steps, batch)
         returns, value = self._targets(imagined, partner, seats.expand(steps + 1, batch))
-        weight = self.config.lambda_xp * min(1.0, (self.updates + 1) / max(1, self.config.lambda_warmup))
+        weight = self.lambda_now()
         advantage = signed_advantage(Kind.XP, returns - value[:-1], weight=weight, scale=self.scale.value())
         own = imagined.actions.gather(-1, seat.unsqueeze(-1)).squeeze(-1)
         log_prob, entropy = self._policy_terms(latent, seat, own)

@@ -8,7 +8,7 @@ import numpy as np
 
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked.layout import DIRECTIONS
-from popgen.envs.overcooked.rules import FIRST_SOUP, NOTHING, SOUP_CODE, SOUPS
+from popgen.envs.overcooked.rules import NOTHING, SOUP_CODE, SOUPS
 from popgen.envs.overcooked.start import ITEM_CODE
 
 if TYPE_CHECKING:
@@ -67,9 +67,9 @@ def to_overcooked_ai(env: OvercookedEnv, row: np.ndarray) -> Any:
     from overcooked_ai_py.mdp.overcooked_mdp import ObjectState, OvercookedState, PlayerState, SoupState
 
     def thing(code: int, cell: tuple[int, int], cooking: int = 1) -> Any:
-        if code < FIRST_SOUP:
+        if code < k.FIRST_SOUP:
             return ObjectState(ITEM_NAME[code], cell)
-        mix = SOUPS[code - FIRST_SOUP]
+        mix = SOUPS[code - k.FIRST_SOUP]
         tick = -1 if cooking == 0 else env.rules.cook_time[mix] - (cooking - 1)
         names = ["onion"] * mix[0] + ["tomato"] * mix[1]
         return SoupState(cell, [ObjectState(name, cell) for name in names], cooking_tick=tick)

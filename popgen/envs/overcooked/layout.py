@@ -119,7 +119,7 @@ def _layout_folder() -> Path | None:
 
 
 def _from_file(layout: str) -> Layout:
-    path = Path(layout)
+    path = Path(str(layout))
     named = path.suffix != ".layout" and len(path.parts) == 1
     if named:
         folder = _layout_folder()
@@ -134,11 +134,11 @@ def _from_file(layout: str) -> Layout:
         raise UserError("env.layout", f"unknown layout {layout!r}", fix)
     try:
         config = _literal(path.read_text())
-        text = config.pop("grid")
-    except (OSError, SyntaxError, ValueError, KeyError, AttributeError, TypeError) as error:
+        rows = _rows(config.pop("grid"))
+    except (OSError, SyntaxError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError("env.layout", f"cannot read {path.name}: {reason}", "it must be a dict with a 'grid'") from None
-    return Layout(layout if named else path.stem, _rows(text), rule_keys(config, "env.layout"), named)
+    return Layout(layout if named else path.stem, rows, rule_keys(config, "env.layout"), named)
 
 
 class _Infinities(ast.NodeTransformer):
@@ -160,7 +160,9 @@ def _rows(text: str) -> tuple[str, ...]:
 
 def _check_grid(layout: Layout, field: str) -> None:
     rows = layout.rows
-    if len({len(row) for row in rows}) != 1 or not rows[0]:
+    if not any(rows):
+        raise UserError(field, "is empty", "give rows of X, O, T, D, P, S, 1, 2 and spaces")
+    if len({len(row) for row in rows}) != 1:
         raise UserError(field, f"rows of different lengths {[len(row) for row in rows]}", "make all rows equally long")
     if layout.width * layout.height > MAX_CELLS:
         raise UserError(field, f"{layout.width} x {layout.height} cells are too many", f"use at most {MAX_CELLS}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked.layout import DIRECTIONS
-from popgen.envs.overcooked.rules import DISH, FIRST_SOUP, ONION, SOUPS, TOMATO
+from popgen.envs.overcooked.rules import SOUPS
 
 if TYPE_CHECKING:
     from popgen.envs.overcooked.env import OvercookedEnv
@@ -26,9 +26,9 @@ HATS = ((64, 104, 216), (56, 152, 72))
 
 def _letters(code: int) -> str:
     """o, t, d or the letters of a soup in brackets."""
-    if code < FIRST_SOUP:
+    if code < k.FIRST_SOUP:
         return " otd"[code].strip()
-    onions, tomatoes = SOUPS[code - FIRST_SOUP]
+    onions, tomatoes = SOUPS[code - k.FIRST_SOUP]
     return f"[{'o' * onions}{'t' * tomatoes}]"
 
 
@@ -118,7 +118,7 @@ def _draw_tile(tile: np.ndarray, mark: str) -> None:
 def _draw_soup(tile: np.ndarray, code: int, x: float, y: float, radius: float) -> None:
     """Broth with one dot per ingredient."""
     _disc(tile, x, y, radius, COLOURS["broth"])
-    onions, tomatoes = SOUPS[code - FIRST_SOUP]
+    onions, tomatoes = SOUPS[code - k.FIRST_SOUP]
     for i, name in enumerate(["onion"] * onions + ["tomato"] * tomatoes):
         angle = 2.1 * i - 1.57
         _disc(tile, x + radius * 0.5 * np.cos(angle), y + radius * 0.5 * np.sin(angle), radius * 0.35, COLOURS[name])
@@ -137,13 +137,13 @@ def _draw_pot(tile: np.ndarray, code: int, cooking: int) -> None:
 
 
 def _draw_item(tile: np.ndarray, code: int, x: float, y: float) -> None:
-    if code in (ONION, TOMATO):
+    if code in (k.ONION, k.TOMATO):
         _disc(tile, x, y, 6, COLOURS["dark"])
-        _disc(tile, x, y, 5, COLOURS["onion" if code == ONION else "tomato"])
+        _disc(tile, x, y, 5, COLOURS["onion" if code == k.ONION else "tomato"])
         return
     _disc(tile, x, y, 8, COLOURS["dark"])
     _disc(tile, x, y, 7, COLOURS["dish"])
-    if code == DISH:
+    if code == k.DISH:
         _disc(tile, x, y, 4, (216, 216, 216))
     else:
         _draw_soup(tile, code, x, y, 5.5)

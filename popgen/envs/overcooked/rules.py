@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from popgen.envs.overcooked.kernels import DISH, FIRST_SOUP, ONION, TOMATO
+from popgen.envs.overcooked.kernels import FIRST_SOUP
 from popgen.errors import UserError
 
 NOTHING = 0
@@ -70,6 +70,8 @@ def rule_keys(config: Mapping[str, Any], field: str) -> dict[str, Any]:
         UserError: a key that no layout file has.
     """
     known = _ORDER_KEYS + _RECIPE_KEYS
+    if not isinstance(config, Mapping):
+        raise UserError(field, f"rules must be a mapping, got {type(config).__name__}", "write key: value")
     for key in config:
         if key not in known + _IGNORED_KEYS:
             close = difflib.get_close_matches(str(key), known, 1)
@@ -87,6 +89,7 @@ def resolve(config: Mapping[str, Any], field: str) -> Rules:
     Raises:
         UserError: keys that exclude each other, or values overcooked_ai would not take.
     """
+    _check_types(config, field)
     _check_clashes(config, field)
     size = config.get("max_num_ingredients", MAX_INGREDIENTS)
     if size not in range(1, MAX_INGREDIENTS + 1):
@@ -110,6 +113,19 @@ def resolve(config: Mapping[str, Any], field: str) -> Rules:
         reward[soup] = float(value * (factor if soup in bonus else 1)) if soup in orders else 0.0
         cook_time[soup] = _cook_time(_figure(config, soup, named, "cook_time", "recipe_times", "time"), field)
     return Rules(reward, cook_time, size)
+
+
+def _check_types(config: Mapping[str, Any], field: str) -> None:
+    for key in ("start_all_orders", "start_bonus_orders", "recipe_values", "recipe_times"):
+        if not isinstance(config.get(key, []), list | tuple | None):
+            raise UserError(field, f"{key} must be a list, got {config[key]!r}")
+    if not isinstance(config.get("start_state"), Mapping | None):
+        raise UserError(field, "start_state must be a mapping", "write it as overcooked_ai's to_dict does")
+    figures = [(key, config[key]) for key in (*_RECIPE_KEYS[2:], "order_bonus") if key in config]
+    figures += [(key, value) for key in ("recipe_values", "recipe_times") for value in config.get(key) or ()]
+    for key, value in figures:
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
+            raise UserError(field, f"{key} must be a number, got {value!r}")
 
 
 def _check_clashes(config: Mapping[str, Any], field: str) -> None:

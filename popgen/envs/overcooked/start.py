@@ -9,10 +9,10 @@ import numpy as np
 
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked.layout import DIRECTIONS, Layout
-from popgen.envs.overcooked.rules import DISH, NOTHING, ONION, SOUP_CODE, TOMATO, Rules
+from popgen.envs.overcooked.rules import NOTHING, SOUP_CODE, Rules
 from popgen.errors import UserError
 
-ITEM_CODE = {"onion": ONION, "tomato": TOMATO, "dish": DISH}
+ITEM_CODE = {"onion": k.ONION, "tomato": k.TOMATO, "dish": k.DISH}
 
 
 def state_size(layout: Layout) -> int:

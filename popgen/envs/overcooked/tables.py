@@ -12,18 +12,7 @@ import numpy as np
 
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked.layout import DIRECTIONS, Layout
-from popgen.envs.overcooked.rules import (
-    DISH,
-    FIRST_SOUP,
-    MAX_INGREDIENTS,
-    NOTHING,
-    NUM_CODES,
-    ONION,
-    SOUP_CODE,
-    SOUPS,
-    TOMATO,
-    Rules,
-)
+from popgen.envs.overcooked.rules import MAX_INGREDIENTS, NOTHING, NUM_CODES, SOUP_CODE, SOUPS, Rules
 
 KINDS = {"X": k.COUNTER, "O": k.ONIONS, "T": k.TOMATOES, "D": k.DISHES, "P": k.POT, "S": k.SERVE}
 
@@ -80,9 +69,9 @@ def build_tables(
     for soup, reward in rules.reward.items():
         values[SOUP_CODE[soup]] = reward
 
-    ingredients = [code for mark, code in (("O", ONION), ("T", TOMATO)) if layout.usable(mark)]
+    ingredients = [code for mark, code in (("O", k.ONION), ("T", k.TOMATO)) if layout.usable(mark)]
     codes = np.zeros((4, 512), np.int16)
-    items = [*ingredients, DISH, *(SOUP_CODE[soup] for soup in soups)]
+    items = [*ingredients, k.DISH, *(SOUP_CODE[soup] for soup in soups)]
     item_names = _fill_bits(table, codes[0], k.ITEM_BIT, items, items_too=True)
     pot_names = _fill_bits(table, codes[1], k.POT_BIT, [SOUP_CODE[soup] for soup in contents], items_too=False)
     cook = max(1, max(rules.cook_time[soup] for soup in soups))
@@ -140,11 +129,11 @@ def _fill_recipes(table: np.ndarray, rules: Rules) -> None:
 
 def _tests(items_too: bool) -> list[tuple[str, list[bool]]]:
     """Name and value per object code of every bit that may describe an object."""
-    items = (("onion", ONION), ("tomato", TOMATO), ("dish", DISH)) if items_too else ()
+    items = (("onion", k.ONION), ("tomato", k.TOMATO), ("dish", k.DISH)) if items_too else ()
     tests = [(name, [code == item for code in range(NUM_CODES)]) for name, item in items]
     for column, ingredient in enumerate(("onions", "tomatoes")):
         for level in range(1, MAX_INGREDIENTS + 1):
-            values = [False] * FIRST_SOUP + [soup[column] >= level for soup in SOUPS]
+            values = [False] * k.FIRST_SOUP + [soup[column] >= level for soup in SOUPS]
             tests.append((f"soup_{ingredient}>={level}", values))
     return tests
 

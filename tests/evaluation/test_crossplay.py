@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted import HORIZON, ONE, STAY, TWO, Cast, Script
+
+from popgen.errors import UserError
+from popgen.evaluation.crossplay import CrossPlayResult, Estimate, Obstruction, Pairing, evaluate_population
+from popgen.population import load_population
+
+
+def pairing(row: str, column: str, mean: float, error: float = 0.1) -> Pairing:
+    figure = Estimate(mean, error)
+    return Pairing((row, column), np.array([mean]), figure, figure, figure, np.zeros((2, 2)))
+
+
+def result(scores: dict[tuple[str, str], float], members: tuple[int, ...], error: float = 0.1) -> CrossPlayResult:
+    base = evaluate_population(Cast(Script([STAY])), 1, 0)  # type: ignore[arg-type]
+    pairings = {key: pairing(*key, mean, error) for key, mean in scores.items()}
+    return replace(base, members=members, pairings=pairings)
+
+
+def test_estimate_by_hand() -> None:
+    figure = Estimate.of(np.array([1.0, 2.0, 3.0, 6.0]))
+    # mean 3, squared deviations 4 + 1 + 0 + 9 = 14, s^2 = 14 / 3, error = sqrt(14 / 3 / 4)
+    assert figure.mean == 3.0 and figure.error == pytest.approx(math.sqrt(14 / 12))
+    assert Estimate.of(np.array([5.0])).mean == 5.0 and math.isnan(Estimate.of(np.array([5.0])).error)
+    assert math.isnan(Estimate.of(np.array([])).mean)
+
+
+def test_average_by_hand() -> None:
+    average = Estimate.average([Estimate(1.0, 0.3), Estimate(3.0, 0.4)])
+    assert average.mean == 2.0 and average.error == pytest.approx(0.25)
+    assert math.isnan(Estimate.average([]).mean)
+
+
+def test_below_needs_two_standard_errors_of_the_difference() -> None:
+    # sqrt(0.3^2 + 0.4^2) = 0.5, so the difference must exceed 1
+    assert Estimate(0.0, 0.3).below(Estimate(1.01, 0.4))
+    assert not Estimate(0.0, 0.3).below(Estimate(0.99, 0.4))
+    assert Estimate(0.0, math.nan).below(Estimate(0.1, 0.4))
+    assert not Estimate(math.nan, 0.1).below(Estimate(1.0, 0.1))
+    assert not Estimate(0.0, 0.1).below(Estimate(math.nan, math.nan))
+
+
+def test_rows_are_seat_0_and_columns_seat_1() -> None:
+    got = evaluate_population(Cast(Script([ONE]), Script([TWO, STAY])), 4, 0)  # type: ignore[arg-type]
+    mean, error = got.table(got.labels)
+    # Per episode both give 6 points in seat 0 and 60 in seat 1: `two` is worth double but played half as often.
+    np.testing.assert_array_equal(mean, [[66, 66], [66, 66]])
+    np.testing.assert_array_equal(error, 0)
+    assert got.score(1, 2).mean == 66 and got.score(1, "idle").mean == 6 and got.score("idle", 1).mean == 60
+    np.testing.assert_array_equal(got.pairings["1", "2"].events, [[6, 0], [0, 3]])
+    np.testing.assert_array_equal(got.pairings["2", "1"].events, [[0, 3], [6, 0]])
+    assert got.pairings["1", "2"].reward.mean == 132 and got.pairings["1", "2"].shaped.mean == 6 + 15
+    assert got.beside("idle", 1).mean == 6 and got.beside("idle", 0).mean == 60 and got.beside("idle").mean == 33
+    assert 6 <= got.score(1, "random").mean <= 126 and got.score(1, "random").error > 0
+    assert len(got.pairings) == 2 * 2 + 2 * 2 * 2 and got.steps == 12 * 4 * HORIZON
+
+
+def test_unequal_seats_and_means() -> None:
+    asymmetric = Script([ONE], [STAY])
+    got = evaluate_population(Cast(asymmetric, Script([TWO])), 2, 0)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(got.table(got.labels)[0], [[6, 126], [12, 132]])
+    assert got.sp.mean == (6 + 132) / 2 and got.xp.mean == (126 + 12) / 2
+
+
+def test_mean_xp_is_over_ordered_pairs() -> None:
+    scores = {(str(i), str(j)): 10.0 * i + j for i in (1, 2, 3) for j in (1, 2, 3)}
+    got = result(scores, (1, 2, 3), error=0.6)
+    assert got.sp.mean == pytest.approx((11 + 22 + 33) / 3)
+    assert got.xp.mean == pytest.approx((12 + 13 + 21 + 23 + 31 + 32) / 6)
+    assert got.sp.error == pytest.approx(0.6 / math.sqrt(3)) and got.xp.error == pytest.approx(0.6 / math.sqrt(6))
+
+
+def test_one_member_has_no_xp() -> None:
+    got = evaluate_population(Cast(Script([ONE])), 1, 0)  # type: ignore[arg-type]
+    assert got.sp.mean == 66 and math.isnan(got.xp.mean) and math.isnan(got.sp.error)
+    assert got.obstructions == () and got.obstruction == {"random": False, "idle": False}
+
+
+def scores(xp: float, random: float, idle: float) -> dict[tuple[str, str], float]:
+    table = {("1", "1"): 10.0, ("2", "2"): 10.0, ("1", "2"): xp, ("2", "1"): 5.0}
+    for partner, score in (("random", random), ("idle", idle)):
+        for member in ("1", "2"):
+            table[member, partner] = table[partner, member] = score
+    return table
+
+
+def test_obstruction_is_xp_below_play_with_a_random_or_idle_partner() -> None:
+    assert result(scores(xp=1.0, random=1.2, idle=0.0), (1, 2)).obstructions == ()  # within two errors
+    got = result(scores(xp=1.0, random=2.0, idle=0.0), (1, 2))
+    xp, beside = Estimate(1.0, 0.1), Estimate(2.0, 0.1)
+    assert got.obstructions == (
+        Obstruction((1, 2), "random", 1, xp, beside),
+        Obstruction((1, 2), "random", 2, xp, beside),
+    )
+    assert got.obstruction == {"random": False, "idle": False}  # mean XP is 3
+    assert result(scores(xp=1.0, random=3.5, idle=3.4), (1, 2)).obstruction == {"random": True, "idle": True}
+    assert result(scores(xp=1.0, random=2.0, idle=3.4), (1, 2)).obstruction == {"random": False, "idle": True}
+
+
+def test_each_member_is_compared_in_its_own_seat() -> None:
+    table = scores(xp=1.0, random=0.0, idle=0.0)
+    table["random", "2"] = 4.0  # member 2 in seat 1 does better with a random partner in seat 0
+    table["random", "1"] = table["2", "random"] = 4.9  # the seats that (1, 2) does not have
+    (found,) = result(table, (1, 2)).obstructions
+    assert (found.pair, found.partner, found.member, found.beside.mean) == ((1, 2), "random", 2, 4.0)
+
+
+def test_same_seed_same_result_and_chosen_members(random_population: Path) -> None:
+    population = load_population(random_population)
+    first, again = (evaluate_population(population, 3, 5) for _ in range(2))
+    for key, one in first.pairings.items():
+        np.testing.assert_array_equal(one.events, again.pairings[key].events)
+    assert any(
+        (p.events != evaluate_population(population, 3, 6).pairings[k].events).any() for k, p in first.pairings.items()
+    )
+    chosen = evaluate_population(population, 3, 5, [2])
+    assert chosen.members == (2,) and set(chosen.pairings) == {
+        ("2", "2"), ("2", "random"), ("random", "2"), ("2", "idle"), ("idle", "2")
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("members", "episodes", "told"),
+    [
+        ([3], 1, "no member 3"),
+        ([0], 1, "no member 0"),
+        ([1, 1], 1, "different"),
+        ([], 1, "different"),
+        (None, 0, "at least 1"),
+    ],
+)
+def test_bad_requests(random_population: Path, members: list[int] | None, episodes: int, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        evaluate_population(load_population(random_population), episodes, 0, members)
+
+
+def test_an_empty_population_cannot_be_evaluated() -> None:
+    with pytest.raises(UserError, match="has no members yet"):
+        evaluate_population(Cast(), 1, 0)  # type: ignore[arg-type]

@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from popgen.envs import make_env
+from popgen.policies import FeedForwardPolicy, RandomPolicy
+from popgen.population import PopulationWriter, load_population
+from popgen.population.show import describe, render
+
+
+def make(path: Path) -> Path:
+    spec = make_env("rendezvous/mppmr", 1).spec
+    writer = PopulationWriter(path, spec, method="xpm_wm", config_digest="abcdef0123456789", seed=3)
+    policy = FeedForwardPolicy(spec.views["features"], spec.num_actions, units=8, layers=1)
+    writer.add_member(policy, seed=1, steps={"SP": 1_000, "random": 200}, training={"v": np.zeros(5, np.float32)})
+    writer.add_member(RandomPolicy(5), seed=2, steps={"SP": 10, "XP": 4})
+    return path
+
+
+def test_describe_adds_up(tmp_path: Path) -> None:
+    told = describe(load_population(make(tmp_path)))
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert told["steps"] == {"random": 200, "SP": 1_010, "XP": 4} and told["total_steps"] == 1_214
+    assert list(told["steps"]) == ["random", "SP", "XP"]
+    first, second = told["members"]
+    assert first["parameters"] == (25 + 2) * 8 + 8 + 8 * 5 + 5 and second["parameters"] == 0
+    assert first["total_steps"] == 1_200 and first["kind"] == "feed_forward" and second["kind"] == "random"
+    on_disk = sum(path.stat().st_size for path in tmp_path.rglob("member_*/*"))
+    assert first["bytes"] + second["bytes"] == told["bytes"] == on_disk
+    assert told["manifest"]["method"] == "xpm_wm" and told["path"] == str(tmp_path)
+
+
+def test_render_says_what_is_there(tmp_path: Path) -> None:
+    text = io.StringIO()
+    Console(file=text, width=120).print(render(load_population(make(tmp_path))))
+    for part in ("rendezvous/mppmr", "xpm_wm, seed 3, config abcdef012345", "1,214 environment steps", "feed_forward",
+                 "1,200", "SP steps", "XP steps", "random steps", "popgen 0."):  # fmt: skip
+        assert part in text.getvalue(), part
+
+
+def test_an_empty_population_can_be_shown(tmp_path: Path) -> None:
+    spec = make_env("rendezvous/mppmr", 1).spec
+    PopulationWriter(tmp_path, spec, method="xpm_wm", config_digest="d", seed=0)
+    population = load_population(tmp_path)
+    assert describe(population)["members"] == [] and describe(population)["total_steps"] == 0
+    text = io.StringIO()
+    Console(file=text, width=100).print(render(population))
+    assert "0 environment steps" in text.getvalue()
