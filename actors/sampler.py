@@ -47,9 +47,7 @@ class SamplerActor:
         """Start fresh episodes of the given teams; `parts` holds a policy for every member in them."""
         env = build_env(self.env_config, sum(team.envs for team in teams), seed)
         policies = {member: build_policy(p.kind, p.config, p.weights, env.spec) for member, p in parts.items()}
-        self.sampler = Sampler(
-            env, teams, policies, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence
-        )
+        self.sampler = Sampler(env, teams, policies, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence)
 
     def collect(self, steps: int, load: dict[int, Weights] | None = None) -> tuple[list[Segment], Collected]:
         """Play `steps` joint steps, with new weights for the given members; segments and their counts."""

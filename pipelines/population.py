@@ -189,7 +189,9 @@ class Driver:
         phase, crew = self.config.phase2, self.crew
         partners = {k: under("actor", weights) for k, weights in self.members.items()}
         filters = {k: under("filter", weights) for k, weights in self.members.items()}
-        ray.get([crew.agent.begin_member.remote(member, seed, partners), crew.model.begin_member.remote(member, filters)])
+        ray.get(
+            [crew.agent.begin_member.remote(member, seed, partners), crew.model.begin_member.remote(member, filters)]
+        )
         rounds = self._rounds()
         total = phase.first_updates + (rounds - 1) * phase.updates_per_round
         self.reporter.phase(f"member {member}: imagined self-play and cross-play", total)
@@ -244,7 +246,10 @@ class Driver:
 
     def _parts(self, weights: Weights) -> PolicyParts:
         config = self.config
-        sizes = {"world_model": config.world_model.model_dump(mode="json"), "agent": config.agent.model_dump(mode="json")}
+        sizes = {
+            "world_model": config.world_model.model_dump(mode="json"),
+            "agent": config.agent.model_dump(mode="json"),
+        }
         return PolicyParts("world_model", sizes, weights)
 
     def _judge(
@@ -363,8 +368,10 @@ class FirstMember:
         per_update = self.driver.config.agent.starts_sp
 
         def sample() -> Any:
-            return crew.samplers[0].collect.options(num_returns=2).remote(
-                phase.steps_per_iteration, {1: ray.get(self.acting)}
+            return (
+                crew.samplers[0]
+                .collect.options(num_returns=2)
+                .remote(phase.steps_per_iteration, {1: ray.get(self.acting)})
             )
 
         def learn_model() -> Any:

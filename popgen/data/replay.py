@@ -145,7 +145,9 @@ class Replay:
             self._cache[key] = found
         return self._cache[key]
 
-    def sample(self, batch: int, length: int, query: Query, *, event_fraction: float = 0.0, turn: int = 0) -> np.ndarray:
+    def sample(
+        self, batch: int, length: int, query: Query, *, event_fraction: float = 0.0, turn: int = 0
+    ) -> np.ndarray:
         """First rows of `batch` windows of `length`; a share contains an event, the types in turn.
 
         Raises:
@@ -164,7 +166,9 @@ class Replay:
 
     def before_events(self, batch: int, length: int, query: Query, events: list[int], reach: int) -> np.ndarray:
         """First rows of windows whose last state lies up to `reach` steps before one of the events, in its episode."""
-        found = np.unique(np.concatenate([self.rows(query, event) for event in events])) if events else np.array([], int)
+        found = (
+            np.unique(np.concatenate([self.rows(query, event) for event in events])) if events else np.array([], int)
+        )
         if not len(found):
             return self.sample(batch, length, query)
         lead = self.rng.integers(0, reach, size=batch * 4)
@@ -214,7 +218,12 @@ class Replay:
     def state(self) -> dict[str, Any]:
         """Everything needed to go on: arrays of the filled part, counters and the generator (JSON-able)."""
         arrays = {name: getattr(self, name)[: self.size].copy() for name in self.COLUMNS}
-        counters = {"head": self.head, "streams": self.streams, "added": self.added, "rng": self.rng.bit_generator.state}
+        counters = {
+            "head": self.head,
+            "streams": self.streams,
+            "added": self.added,
+            "rng": self.rng.bit_generator.state,
+        }
         return {"arrays": arrays, "counters": counters}
 
     def load_state(self, state: dict[str, Any]) -> None:

@@ -33,9 +33,7 @@ def draw(replay: Replay, request: Request, length: int, view: str, turn: int = 0
     if request.events:
         starts = replay.before_events(request.count, length, request.query, list(request.events), request.reach)
     else:
-        starts = replay.sample(
-            request.count, length, request.query, event_fraction=request.event_fraction, turn=turn
-        )
+        starts = replay.sample(request.count, length, request.query, event_fraction=request.event_fraction, turn=turn)
     return replay.windows(starts, length, view)
 
 

@@ -29,7 +29,13 @@ FAMILIES: dict[str, Callable[[str, int, int, dict[str, Any]], BatchedEnv]] = {
 
 def env_names() -> list[str]:
     """Names that need no further parameters: the tested entries of the registry."""
-    layouts = ("cramped_room", "asymmetric_advantages", "coordination_ring", "forced_coordination", "counter_circuit_o_1order")
+    layouts = (
+        "cramped_room",
+        "asymmetric_advantages",
+        "coordination_ring",
+        "forced_coordination",
+        "counter_circuit_o_1order",
+    )
     return [f"overcooked/{layout}" for layout in layouts] + ["rendezvous/mppmr"]
 
 

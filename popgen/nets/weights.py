@@ -51,7 +51,9 @@ def under(prefix: str, weights: Weights) -> Weights:
 def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, np.ndarray]:
     """Adam's moments and step counts by parameter number."""
     state = optimiser.state_dict()["state"]
-    return {f"{index}.{name}": value.cpu().numpy().copy() for index, slots in state.items() for name, value in slots.items()}
+    return {
+        f"{index}.{name}": value.cpu().numpy().copy() for index, slots in state.items() for name, value in slots.items()
+    }
 
 
 def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, np.ndarray]) -> None:

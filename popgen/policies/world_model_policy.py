@@ -67,7 +67,9 @@ class WorldModelPolicy:
         w.load_weights(self._parts, weights)
 
     @classmethod
-    def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> WorldModelPolicy:
+    def from_parts(
+        cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec
+    ) -> WorldModelPolicy:
         """Build from `config()` and `weights()`; raises ValueError if they do not fit."""
         policy = cls(
             WorldModelConfig.model_validate(config["world_model"]), AgentConfig.model_validate(config["agent"]), spec

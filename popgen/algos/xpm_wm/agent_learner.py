@@ -1,6 +1,6 @@
 """One member's learner: imagined self-play and cross-play, and the XPM-Sim objective (paper, eq. XPM-Sim).
 
-    J(j) = J_SP(j | starts in SP and XP states) - lambda_XP max_k J_XP(j, k | starts in XP states)
+J(j) = J_SP(j | starts in SP and XP states) - lambda_XP max_k J_XP(j, k | starts in XP states)
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ class AgentLearner:
     Set the world model, start states and partners, then call `update`.
     """
 
-    def __init__(self, config: AgentConfig, model_config: WorldModelConfig, spec: EnvSpec, member: int, seed: int) -> None:
+    def __init__(
+        self, config: AgentConfig, model_config: WorldModelConfig, spec: EnvSpec, member: int, seed: int
+    ) -> None:
         self.config, self.model_config, self.spec, self.member = config, model_config, spec, member
         self.dtype = rollout_dtype(config.precision)
         self.generator = torch.Generator().manual_seed(seed + 1)
@@ -191,9 +193,7 @@ class AgentLearner:
         both = torch.tensor([0, 1]).expand(steps, batch, 2)
         log_prob, entropy = self._policy_terms(pair, both, imagined.actions)
         running = imagined.running.unsqueeze(-1)
-        actor_loss = reinforce(
-            log_prob, advantage.unsqueeze(-1), entropy, running, entropy_scale=self.config.entropy
-        )
+        actor_loss = reinforce(log_prob, advantage.unsqueeze(-1), entropy, running, entropy_scale=self.config.entropy)
         critic_loss = (imagined.running * self.critics[str(SELF)].loss(latent, seat[:-1], returns)).mean()
         metrics = {
             "entropy": float(entropy.detach().mean()),

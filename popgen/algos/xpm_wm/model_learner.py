@@ -163,9 +163,7 @@ class ModelLearner:
         t, b = steps[picked], rows[picked]
         z = to_indices(self.model.filter.grouped(seen.latent.z[t, b].detach()))
         partner = windows.partner[b].astype(np.int16)
-        return Starts(
-            seen.latent.h[t, b].detach().float().numpy(), z.numpy(), np.full(count, pool, np.uint8), partner
-        )
+        return Starts(seen.latent.h[t, b].detach().float().numpy(), z.numpy(), np.full(count, pool, np.uint8), partner)
 
     def state(self) -> dict[str, Any]:
         """Weights, optimiser and generators, to go on from exactly here."""

@@ -29,8 +29,8 @@ def model_batch(config: RunConfig, member: int) -> Draws:
     """Windows of one world-model update.
 
     Member 1 learns from everything it has, a share of it from the last rows: a policy finds the rewards that the
-    model only imagines, and what it then does in reality must be seen often to be unlearned. Later members mix the kept buffers with their own new data, the
-    latter half self-play and half cross-play.
+    model only imagines, and what it then does in reality must be seen often to be unlearned. Later members mix the
+    kept buffers with their own new data, the latter half self-play and half cross-play.
     """
     batch, events = config.world_model.batch, config.replay.event_fraction
     if member == 1:

@@ -30,7 +30,9 @@ class Starts:
         return Starts(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
-def draw_self_play(starts: Starts, count: int, new_share: float, from_xp: float, rng: np.random.Generator) -> np.ndarray:
+def draw_self_play(
+    starts: Starts, count: int, new_share: float, from_xp: float, rng: np.random.Generator
+) -> np.ndarray:
     """Rows for imagined self-play: SP *and* XP states (paper, eq. XPM-Sim), which makes mixed play unnecessary.
 
     `new_share` of them come from this member's own data if there is any, of which `from_xp` from cross-play.
