@@ -9,7 +9,7 @@ export MLFLOW_DISABLE_TELEMETRY := true
 .PHONY: demo test lint format oracle bench install clean
 
 demo: install  ## a population of two in the cramped room, with its SP/XP matrix
-	$(BIN)/popgen run env=overcooked/cramped_room scale=demo
+	$(BIN)/popgen run env=overcooked/cramped_room scale=demo seed=1
 
 test: install
 	$(BIN)/python -m pytest
