@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from actors.sampler import Collected
+from actors.tracker import RemoteTracker
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
 from popgen.envs.base import EnvSpec
@@ -21,7 +22,6 @@ from popgen.policies.base import Policy
 from popgen.policies.world_model_policy import WorldModelPolicy
 from popgen.population import PopulationWriter
 from popgen.population.manifest import MemberInfo
-from popgen.tracking import Tracker
 from popgen.types import Kind, LedgerEntry
 
 
@@ -47,7 +47,8 @@ class Books:
             seed=config.run.seed,
             resume=True,
         )
-        self.tracker = Tracker(config.tracking, self.dir, self.run_id, config.model_dump(mode="json"), self._resumed())
+        params = config.model_dump(mode="json")
+        self.tracker = RemoteTracker(config.tracking, self.dir, self.run_id, params, self._resumed())
 
     def _check_same_config(self) -> None:
         path = self.dir / "config.json"
@@ -109,8 +110,11 @@ class Books:
         self.population.add_member(policy, seed=seed, steps=steps, training=training, extra=extra)
         total = sum(sum(self.training_steps(k).values()) for k in range(1, member + 1))
         self.tracker.log_scaling(member, total)
-        self.tracker.flush()
-        (self.dir / "tracking.json").write_text(json.dumps(self.tracker.state()))
+        self.save_tracking()
+
+    def save_tracking(self) -> None:
+        """Keep the MLflow run ids: a resumed run goes on in the same MLflow runs."""
+        (self.dir / "tracking.json").write_text(json.dumps(self.tracker.flush()))
 
     def adopt(self, policy: Policy, info: MemberInfo, training: Weights | None) -> None:
         """Copy a member of another run; its steps stay in that run's ledger and in the member's record."""

@@ -46,8 +46,8 @@ class Crew:
     agent: Any
 
     @staticmethod
-    def hire(config: RunConfig, attempt: int) -> Crew:
-        """Create all actors; sampler names carry the attempt, so that a resumed run's ledger keys are new."""
+    def hire(config: RunConfig, attempt: str) -> Crew:
+        """Create all actors. Sampler names carry the run and its attempt: replays and ledger know a segment by them."""
         cluster, seed = config.cluster, config.run.seed
         sampler = ray.remote(SamplerActor).options(**options(cluster, cluster.sampler_cpus))
         replay = ray.remote(ReplayActor).options(**options(cluster, cluster.replay_cpus))

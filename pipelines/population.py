@@ -62,9 +62,11 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
     spec = build_env(config.env, 1).spec
     books = Books(config, spec)
     reporter.note(f"run {books.run_id} in {books.dir}")
-    mine = start_ray(config.cluster)
-    status = "FAILED"
+    mine, status = False, "FAILED"
     try:
+        mine = start_ray(config.cluster)
+        books.tracker.start()
+        books.save_tracking()
         driver = Driver(config, spec, books, reporter)
         driver.run()
         result = driver.finish()
@@ -84,7 +86,7 @@ class Driver:
 
     def __init__(self, config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> None:
         self.config, self.spec, self.books, self.reporter = config, spec, books, reporter
-        self.crew = Crew.hire(config, books.attempt)
+        self.crew = Crew.hire(config, f"{books.run_id}.{books.attempt}")
         self.members: dict[int, Weights] = {}
         self.steps = 0
         self.began = time.time()

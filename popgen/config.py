@@ -25,12 +25,22 @@ def _a_number(value: Any) -> Any:
 
 _Int = Annotated[int, BeforeValidator(_a_number)]
 _Float = Annotated[float, BeforeValidator(_a_number), Field(allow_inf_nan=False)]
-Positive = Annotated[_Int, Field(ge=1)]
-NonNegative = Annotated[_Int, Field(ge=0)]
-Number = _Float
+Positive = Annotated[_Int, Field(ge=1, le=10**12)]
+NonNegative = Annotated[_Int, Field(ge=0, le=10**12)]
+Layers = Annotated[_Int, Field(ge=1, le=64)]
+Width = Annotated[_Int, Field(ge=1, le=16_384)]  # of a layer
+Batch = Annotated[_Int, Field(ge=1, le=100_000)]  # what is held in memory or stepped at once
+Number = Annotated[_Float, Field(ge=-1e12, le=1e12)]
 Rate = Annotated[_Float, Field(gt=0.0, le=1.0)]
 Fraction = Annotated[_Float, Field(ge=0.0, le=1.0)]
-Weight = Annotated[_Float, Field(ge=0.0)]
+Weight = Annotated[_Float, Field(ge=0.0, le=1e9)]
+UniformShare = Annotated[_Float, Field(ge=1e-6, le=1.0)]  # mixed into probabilities, whose logarithms are taken
+PREFILL_CHUNK = 400
+"""Steps of each environment in one segment of random play."""
+
+OPEN_LOOP = 4
+"""Steps without observations at which the world model's open-loop figures are taken."""
+
 Text = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is int else value)]
 
 
@@ -50,7 +60,7 @@ class EnvConfig(Schema):
 class PopulationConfig(Schema):
     """Size of the population and, for continuing one, the run whose members it starts from."""
 
-    size: Positive = 3
+    size: Annotated[_Int, Field(ge=1, le=1000)] = 3
     init_from: str | None = None
     init_members: Positive = 1
 
@@ -59,26 +69,30 @@ class WorldModelConfig(Schema):
     """The two-player RSSM (paper, section 4.1 and the table of XPM-WM hyper-parameters)."""
 
     view: Literal["features", "lossless"] = "features"
-    encoder_layers: Positive = 2
-    decoder_layers: Positive = 2
-    cnn_kernels: tuple[Positive, ...] = (5, 3, 3)
-    cnn_channels: Positive = 32
-    units: Positive = 128
-    deter: Positive = 128
-    recurrent_units: NonNegative = 256
-    prior_layers: Positive = 1
-    posterior_layers: Positive = 1
-    head_layers: Positive = 2
-    groups: Positive = 32
+    encoder_layers: Layers = 2
+    decoder_layers: Layers = 2
+    cnn_kernels: Annotated[tuple[Annotated[_Int, Field(ge=1, le=31)], ...], Field(min_length=1, max_length=16)] = (
+        5,
+        3,
+        3,
+    )
+    cnn_channels: Width = 32
+    units: Width = 128
+    deter: Width = 128
+    recurrent_units: Annotated[_Int, Field(ge=0, le=16_384)] = 256
+    prior_layers: Layers = 1
+    posterior_layers: Layers = 1
+    head_layers: Layers = 2
+    groups: Annotated[_Int, Field(ge=1, le=1024)] = 32
     joint_groups: Positive = 16
-    classes: Positive = 8
-    unimix: Fraction = 0.01
+    classes: Annotated[_Int, Field(ge=2, le=256)] = 8
+    unimix: UniformShare = 0.01
     activation: Literal["silu", "leaky_relu"] = "silu"
     norm: StrictBool = True
     learning_rate: Rate = 2e-3
     grad_clip: Weight = 100.0
-    batch: Positive = 64
-    length: Annotated[_Int, Field(ge=2)] = 8
+    batch: Batch = 64
+    length: Annotated[_Int, Field(ge=2, le=1024)] = 8
     kl_dyn: Weight = 1.0
     kl_rep: Weight = 0.03
     free_nats: Weight = 1.0
@@ -94,29 +108,35 @@ class WorldModelConfig(Schema):
             raise ValueError("joint_groups must leave an even, positive number of groups for the two players")
         return self
 
+    @model_validator(mode="after")
+    def _kernels_keep_the_grid(self) -> WorldModelConfig:
+        if any(kernel % 2 == 0 for kernel in self.cnn_kernels):
+            raise ValueError("cnn_kernels must be odd, so that a convolution keeps the grid's size")
+        return self
+
 
 class AgentConfig(Schema):
     """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim)."""
 
-    units: Positive = 128
-    layers: Positive = 2
+    units: Width = 128
+    layers: Layers = 2
     activation: Literal["silu", "leaky_relu"] = "silu"
     norm: StrictBool = True
     actor_input: Literal["model", "latent"] = "model"
-    horizon: Positive = 15
-    starts_sp: Positive = 256
-    starts_xp: Positive = 128
+    horizon: Annotated[_Int, Field(ge=1, le=1000)] = 15
+    starts_sp: Batch = 256
+    starts_xp: Batch = 128
     discount: Fraction = 0.99
     lam: Fraction = 0.95
     actor_lr: Rate = 1e-3
     critic_lr: Rate = 1e-3
     entropy: Weight = 3e-3
     grad_clip: Weight = 100.0
-    unimix: Fraction = 0.01
-    bins: Annotated[_Int, Field(ge=3)] = 65
+    unimix: UniformShare = 0.01
+    bins: Annotated[_Int, Field(ge=3, le=10_001)] = 65
     slow_critic: Fraction = 0.98
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
-    lambda_xp: Weight = 0.5
+    lambda_xp: Weight = 0.35
     lambda_start: Weight = 0.25
     lambda_ramp: NonNegative = 1000
     sp_from_xp: Fraction = 0.5
@@ -125,18 +145,43 @@ class AgentConfig(Schema):
     partner_random: Fraction = 0.3
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
+    @model_validator(mode="after")
+    def _percentiles_are_a_range(self) -> AgentConfig:
+        low, high = self.return_percentiles
+        if not 0.0 <= low < high <= 100.0:
+            raise ValueError("return_percentiles must be two ascending numbers within [0, 100]")
+        return self
+
+
+_TRUNKS = "units", "activation", "norm"
+_FILTER = (
+    *("view", "encoder_layers", "cnn_kernels", "cnn_channels", "deter", "recurrent_units", "posterior_layers"),
+    *("groups", "joint_groups", "classes", *_TRUNKS),
+)
+SHAPES: dict[str, tuple[str, ...]] = {
+    "world_model": (*_FILTER, "decoder_layers", "prior_layers", "head_layers"),
+    "agent": (*_TRUNKS, "layers", "actor_input"),
+}
+"""Fields that decide the shapes of the weights which a continued run takes over."""
+
+ACTING: dict[str, tuple[str, ...]] = {
+    "world_model": (*_FILTER, "unimix", "imagination"),
+    "agent": (*SHAPES["agent"], "unimix"),
+}
+"""Fields that decide how a saved member acts; all others concern training and may change between versions."""
+
 
 class ReplayConfig(Schema):
     """B_SP and B_XP."""
 
-    capacity: Positive = 1_000_000
+    capacity: Annotated[_Int, Field(ge=1, le=2**31)] = 2_000_000
     event_fraction: Fraction = 0.4
 
 
 class Phase1Config(Schema):
     """Member 1: self-play together with the world model."""
 
-    envs: Positive = 64
+    envs: Batch = 64
     prefill_steps: Positive = 256_000
     prefill_interact: Fraction = 0.3
     pretrain_updates: Positive = 1500
@@ -156,41 +201,47 @@ class Phase1Config(Schema):
 class Phase2Config(Schema):
     """Members 2..M: mostly imagination, few real episodes."""
 
-    first_updates: Positive = 500
+    first_updates: Positive = 400
     updates_per_round: Positive = 150
     model_updates: NonNegative = 60
     model_lr: Rate = 5e-4
-    episodes_sp: Positive = 8
-    episodes_xp: Positive = 8
+    episodes_sp: Batch = 8
+    episodes_xp: Batch = 8
     rounds: Positive = 9
     max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
     cache: Positive = 8192
-    starts_random: Fraction = 0.34
-    starts_event: Fraction = 0.30
+    starts_random: Fraction = 0.6
+    starts_event: Fraction = 0.2
     starts_new: Fraction = 0.5
     event_reach: Positive = 10
     new_fraction: Fraction = 0.5
+
+    @model_validator(mode="after")
+    def _shares_of_starts(self) -> Phase2Config:
+        if self.starts_random + self.starts_event > 1.0 + 1e-9:
+            raise ValueError("starts_random and starts_event must not exceed 1 together")
+        return self
 
 
 class EvaluationConfig(Schema):
     """Episodes behind each figure of the SP/XP matrix (per seating)."""
 
-    episodes: Positive = 20
+    episodes: Batch = 20
 
 
 class ClusterConfig(Schema):
     """Where actors run; `address=None` starts a local Ray."""
 
     address: str | None = None
-    num_cpus: Positive | None = None
-    samplers: Positive = 1
+    num_cpus: Annotated[_Int, Field(ge=1, le=100_000)] | None = None
+    samplers: Annotated[_Int, Field(ge=1, le=10_000)] = 1
     sampler_cpus: Weight = 0.1
     replay_cpus: Weight = 0.0
     model_cpus: Weight = 0.9
     agent_cpus: Weight = 0.9
     model_gpus: Weight = 0.0
     agent_gpus: Weight = 0.0
-    threads: Positive = 1
+    threads: Annotated[_Int, Field(ge=1, le=1024)] = 1
     resources: dict[str, Weight] = {}
 
 
@@ -228,6 +279,22 @@ class RunConfig(Schema):
     cluster: ClusterConfig = ClusterConfig()
     tracking: TrackingConfig = TrackingConfig()
     run: RunSection = RunSection()
+
+    @model_validator(mode="after")
+    def _windows_fit(self) -> RunConfig:
+        """Every segment must hold a window of the reports, the caches some windows, the replays a segment."""
+        phase, window = self.phase1, self.world_model.length + OPEN_LOOP
+        prefill = min(PREFILL_CHUNK, phase.prefill_steps // phase.envs)
+        if prefill < window:
+            raise ValueError(f"phase1.prefill_steps must be at least {window} in each of phase1.envs environments")
+        if phase.steps_per_iteration < window:
+            raise ValueError(f"phase1.steps_per_iteration must be at least world_model.length + {OPEN_LOOP} = {window}")
+        segment = phase.envs * max(prefill, phase.steps_per_iteration)
+        if self.replay.capacity < segment:
+            raise ValueError(f"replay.capacity must hold the {segment:,} steps that phase1 adds at once")
+        if self.phase2.cache < 4 * self.world_model.length:
+            raise ValueError("phase2.cache must be at least four times world_model.length")
+        return self
 
     @classmethod
     def parse(cls, values: dict[str, Any]) -> RunConfig:

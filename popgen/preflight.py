@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from popgen.config import RunConfig
+from popgen.config import SHAPES, RunConfig
 from popgen.envs.base import EnvSpec
 from popgen.envs.registry import make_env
 from popgen.errors import UserError
@@ -20,16 +19,6 @@ from popgen.tracking import check_uri
 
 MARGIN = 256 * 2**20
 """Bytes of disk beside buffers and weights: MLflow's file, logs, plots."""
-
-SIZES = {
-    "world_model": (
-        *("view", "encoder_layers", "decoder_layers", "cnn_kernels", "cnn_channels", "units", "deter"),
-        *("recurrent_units", "prior_layers", "posterior_layers", "head_layers", "groups", "joint_groups", "classes"),
-        *("activation", "norm"),
-    ),
-    "agent": ("units", "layers", "activation", "norm", "actor_input"),
-}
-"""Fields that decide the shape of the weights a continued run takes over."""
 
 _RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -151,17 +140,27 @@ def _check_start(config: RunConfig, spec: EnvSpec) -> None:
         raise UserError(
             "population.init_from", f"{run} has members of kind {first.kind}", "choose a run of this method"
         )
-    _check_sizes(config, first.config, run)
+    _check_sizes(config, run)
     if not (run / "checkpoints" / f"member_{wanted:03d}").is_dir():
         problem = f"{run} has no checkpoint of member {wanted}"
         raise UserError("population.init_members", problem, "choose a member that has one")
 
 
-def _check_sizes(config: RunConfig, known: Mapping[str, Any], run: Path) -> None:
+def _check_sizes(config: RunConfig, run: Path) -> None:
+    """The origin's networks must have our sizes; its config.json may be of another version in all else."""
+    path = run / "config.json"
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        problem = f"cannot read {path} ({getattr(error, 'strerror', None) or 'it is no JSON'})"
+        raise UserError("population.init_from", problem, "give a run's folder") from None
     ours = config.model_dump(mode="json")
-    for section, names in SIZES.items():
+    for section, names in SHAPES.items():
+        part = known.get(section) if isinstance(known, dict) else None
+        if not isinstance(part, dict):
+            raise UserError("population.init_from", f"{path} has no {section!r}", "give a run's folder")
         for name in names:
-            there, here = known.get(section, {}).get(name), ours[section][name]
+            there, here = part.get(name), ours[section][name]
             if there != here:
                 raise UserError(f"{section}.{name}", f"is {here!r}, but {there!r} in {run}", "use the same sizes")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -49,4 +50,5 @@ def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = PopulationWriter(run / "population", spec, method="xpm_wm", config_digest=config.digest(), seed=0)
     for member in (1, 2):
         writer.add_member(WorldModelPolicy(config.world_model, config.agent, spec), seed=member, steps={"SP": 1})
+    (run / "config.json").write_text(json.dumps(config.model_dump(mode="json")))
     return run

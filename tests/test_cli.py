@@ -212,6 +212,27 @@ def test_a_run_starts_from_another_run_and_from_nothing_else(
 
 
 @pytest.mark.usefixtures("no_ray")
+def test_a_start_is_compared_by_its_own_config_which_may_be_of_another_version(
+    run: Run, model_run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(model_run, tmp_path / "other")
+    path = tmp_path / "other" / "config.json"
+    known = json.loads(path.read_text())
+    start = ("scale=smoke", "population.init_from=other")
+    known["agent"]["lambda_warmup"] = 5
+    del known["phase2"]
+    path.write_text(json.dumps(known))
+    assert run(*DRY, *start)[0] == 0
+    for name in ("decoder_layers", "prior_layers", "head_layers"):  # none of them in the members' own records
+        refused(run("run", *start, f"world_model.{name}=7"), f"world_model.{name}", "is 7, but 1")
+    for content in ("", "[]", '{"world_model": 1}'):
+        path.write_text(content)
+        refused(run("run", *start), "population.init_from", "config.json")
+    path.unlink()
+    refused(run("run", *start), "population.init_from", "config.json")
+
+
+@pytest.mark.usefixtures("no_ray")
 def test_a_small_disk_is_refused(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage(".")
     monkeypatch.setattr(preflight.shutil, "disk_usage", lambda _: usage._replace(free=10 * 2**20))

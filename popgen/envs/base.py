@@ -20,6 +20,8 @@ class ViewSpec:
         dtype: numpy dtype name.
         binary: all entries are 0 or 1 (Bernoulli reconstruction is then exact).
         scale: largest value an entry can take, to bring counts into [0, 1].
+        maxima: for a view of channels (last dimension) that are counts of different size, the largest value of each;
+            those of maximum 1 hold 0 and 1 only. None where `scale` serves all.
         swap: for a flat view, index array with obs_of_player_1 == obs_of_player_0[swap]; else None.
     """
 
@@ -28,6 +30,7 @@ class ViewSpec:
     binary: bool
     scale: float = 1.0
     swap: tuple[int, ...] | None = None
+    maxima: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)

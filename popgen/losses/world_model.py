@@ -14,12 +14,26 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return (values * mask).sum() / mask.sum().clamp(min=1.0)
 
 
-def reconstruction(logits: Tensor, target: Tensor, *, binary: bool) -> Tensor:
-    """-ln p(o | h, z): Bernoulli for binary views, unit-variance Gaussian otherwise. (T, B, ...) -> (T, B)."""
+def reconstruction(
+    outputs: Tensor, target: Tensor, *, binary: bool | Tensor, precision: float | Tensor = 1.0
+) -> Tensor:
+    """-ln p(o | h, z), up to a constant: Bernoulli where binary, Gaussian elsewhere. (T, B, ..., K) -> (T, B).
+
+    Args:
+        outputs: logits where binary, means elsewhere.
+        binary: of the whole view, or (K,) bool of each of its channels.
+        precision: 1 / variance of the Gaussian, of the whole view or (K,).
+    """
+    if isinstance(binary, Tensor):
+        one, other = binary.nonzero().squeeze(-1), (~binary).nonzero().squeeze(-1)
+        if isinstance(precision, Tensor):
+            precision = precision[other]
+        first = reconstruction(outputs[..., one], target[..., one], binary=True)
+        return first + reconstruction(outputs[..., other], target[..., other], binary=False, precision=precision)
     if binary:
-        loss = F.binary_cross_entropy_with_logits(logits, target, reduction="none")
+        loss = F.binary_cross_entropy_with_logits(outputs, target, reduction="none")
     else:
-        loss = 0.5 * (logits - target).square()
+        loss = 0.5 * precision * (outputs - target).square()
     return loss.flatten(2).sum(-1)
 
 

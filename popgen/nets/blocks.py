@@ -62,15 +62,31 @@ class NormGRUCell(nn.Module):
         return hidden + update * (candidate - hidden)
 
 
+def _conv(kind: type[nn.Conv2d] | type[nn.ConvTranspose2d], inputs: int, outputs: int, kernel: int, bias: bool = True):
+    """Same-padded convolution with the initial weights of `linear`: default ones let the signal fade."""
+    layer = kind(inputs, outputs, kernel, padding=kernel // 2, bias=bias)
+    deviation = math.sqrt(2.0 / ((inputs + outputs) * kernel**2))
+    nn.init.trunc_normal_(layer.weight, std=deviation, a=-2 * deviation, b=2 * deviation)
+    if bias:
+        nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _after_conv(channels: int, activation: str, norm: bool) -> list[nn.Module]:
+    return [*([nn.GroupNorm(1, channels, eps=1e-3)] if norm else []), ACTIVATIONS[activation]()]
+
+
 class ConvEncoder(nn.Module):
     """Same-padded convolutions over a grid view, then flat. (B, W, H, K) -> (B, features)."""
 
-    def __init__(self, shape: Sequence[int], *, channels: int, kernels: Sequence[int], activation: str) -> None:
+    def __init__(
+        self, shape: Sequence[int], *, channels: int, kernels: Sequence[int], activation: str, norm: bool
+    ) -> None:
         super().__init__()
         width, height, planes = shape
         parts: list[nn.Module] = []
         for kernel in kernels:
-            parts += [nn.Conv2d(planes, channels, kernel, padding=kernel // 2), ACTIVATIONS[activation]()]
+            parts += [_conv(nn.Conv2d, planes, channels, kernel), *_after_conv(channels, activation, norm)]
             planes = channels
         self.layers = nn.Sequential(*parts)
         self.features = channels * width * height
@@ -80,10 +96,20 @@ class ConvEncoder(nn.Module):
 
 
 class ConvDecoder(nn.Module):
-    """Transposed convolutions back to a grid view. (B, inputs) -> (B, W, H, K)."""
+    """Transposed convolutions back to a grid view. (B, inputs) -> (B, W, H, K).
+
+    The bias of the output is of its own for every cell: walls and dispensers never move.
+    """
 
     def __init__(
-        self, inputs: int, shape: Sequence[int], *, channels: int, kernels: Sequence[int], activation: str
+        self,
+        inputs: int,
+        shape: Sequence[int],
+        *,
+        channels: int,
+        kernels: Sequence[int],
+        activation: str,
+        norm: bool,
     ) -> None:
         super().__init__()
         self.width, self.height, planes = shape
@@ -92,10 +118,11 @@ class ConvDecoder(nn.Module):
         parts: list[nn.Module] = []
         for index, kernel in enumerate(reversed(kernels)):
             last = index == len(kernels) - 1
-            parts.append(ACTIVATIONS[activation]())
-            parts.append(nn.ConvTranspose2d(channels, planes if last else channels, kernel, padding=kernel // 2))
+            parts += _after_conv(channels, activation, norm)
+            parts.append(_conv(nn.ConvTranspose2d, channels, planes if last else channels, kernel, bias=not last))
         self.layers = nn.Sequential(*parts)
+        self.bias = nn.Parameter(torch.zeros(self.width, self.height, planes))
 
     def forward(self, features: Tensor) -> Tensor:
         grid = self.expand(features).unflatten(-1, (self.channels, self.width, self.height))
-        return self.layers(grid).permute(0, 2, 3, 1)
+        return self.layers(grid).permute(0, 2, 3, 1) + self.bias

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 from torch import nn
 
-from popgen.config import AgentConfig, WorldModelConfig
+from popgen.config import ACTING, AgentConfig, Schema, WorldModelConfig
 from popgen.envs.base import EnvSpec
 from popgen.nets import weights as w
 from popgen.nets.actor_critic import Actor
 from popgen.nets.latents import Latent
 from popgen.world_model.model import LatentFilter
+
+_S = TypeVar("_S", bound=Schema)
 
 
 class WorldModelPolicy:
@@ -55,8 +58,11 @@ class WorldModelPolicy:
             return self.actor.sample(pair, seats, self._generator).numpy().astype(np.uint8)
 
     def config(self) -> dict[str, Any]:
-        """The two schemas the networks are built from."""
-        return {"world_model": self._model.model_dump(mode="json"), "agent": self._agent.model_dump(mode="json")}
+        """The fields of the two schemas that the networks are built from."""
+        return {
+            "world_model": self._model.model_dump(mode="json", include=set(ACTING["world_model"])),
+            "agent": self._agent.model_dump(mode="json", include=set(ACTING["agent"])),
+        }
 
     def weights(self) -> w.Weights:
         """`filter.*` and `actor.*`."""
@@ -70,9 +76,29 @@ class WorldModelPolicy:
     def from_parts(
         cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec
     ) -> WorldModelPolicy:
-        """Build from `config()` and `weights()`; raises ValueError if they do not fit."""
-        policy = cls(
-            WorldModelConfig.model_validate(config["world_model"]), AgentConfig.model_validate(config["agent"]), spec
-        )
+        """Build from `config()` and `weights()`.
+
+        Fields of `config` that do not decide how a policy acts are ignored: they may be another version's.
+
+        Raises:
+            ValueError: a field that decides it is missing or wrong, or the weights do not fit.
+        """
+        policy = cls(_acting(config, "world_model", WorldModelConfig), _acting(config, "agent", AgentConfig), spec)
         policy.load(weights)
         return policy
+
+
+def _acting(config: Mapping[str, Any], section: str, schema: type[_S]) -> _S:
+    """The schema from the acting fields of one section; the rest is at its defaults."""
+    given = config.get(section)
+    if not isinstance(given, Mapping):
+        raise ValueError(f"the config has no {section!r}")
+    missing = [name for name in ACTING[section] if name not in given]
+    if missing:
+        raise ValueError(f"{section}.{missing[0]} is missing")
+    try:
+        return schema.model_validate({name: given[name] for name in ACTING[section]})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in (section, *first["loc"]))
+        raise ValueError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None

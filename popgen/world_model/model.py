@@ -21,10 +21,14 @@ from torch import Tensor, nn
 
 from popgen.config import WorldModelConfig
 from popgen.envs.base import EnvSpec, ViewSpec
+from popgen.losses.world_model import reconstruction
 from popgen.nets import latents
 from popgen.nets.blocks import ConvDecoder, ConvEncoder, NormGRUCell, mlp
 from popgen.nets.latents import Latent
 from popgen.shapes import check
+
+COUNT_DEVIATION = 0.5
+"""Standard deviation, in counts, of the decoder's Gaussian over a channel of counts: neighbours are told apart."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,11 @@ class JointEncoder(nn.Module):
         if len(view.shape) == 3:
             shape = (view.shape[0], view.shape[1], 2 * view.shape[2])
             self.conv = ConvEncoder(
-                shape, channels=config.cnn_channels, kernels=config.cnn_kernels, activation=config.activation
+                shape,
+                channels=config.cnn_channels,
+                kernels=config.cnn_kernels,
+                activation=config.activation,
+                norm=config.norm,
             )
             inputs = self.conv.features
         self.trunk = mlp(inputs, None, **_style(config), layers=config.encoder_layers)
@@ -61,7 +69,10 @@ class JointEncoder(nn.Module):
 
 
 class PlayerDecoder(nn.Module):
-    """One player's observation from (h, z^i): (B, D + C * G) -> logits or means (B, *shape)."""
+    """One player's observation from (h, z^i): (B, D + C * G) -> logits or means (B, *shape).
+
+    `output` is the last bias, one number for each of the observation's.
+    """
 
     def __init__(self, config: WorldModelConfig, view: ViewSpec, inputs: int) -> None:
         super().__init__()
@@ -75,7 +86,12 @@ class PlayerDecoder(nn.Module):
                 channels=config.cnn_channels,
                 kernels=config.cnn_kernels,
                 activation=config.activation,
+                norm=config.norm,
             )
+
+    @property
+    def output(self) -> nn.Parameter:
+        return self.trunk[-1].bias if self.conv is None else self.conv.bias
 
     def forward(self, inputs: Tensor) -> Tensor:
         hidden = self.trunk(inputs)
@@ -89,6 +105,8 @@ class LatentFilter(nn.Module):
         super().__init__()
         self.config = config
         self.view: ViewSpec = spec.views[config.view]
+        maxima = None if self.view.maxima is None else torch.tensor(self.view.maxima)
+        self.register_buffer("maxima", maxima, persistent=False)
         self.num_actions = spec.num_actions
         self.latent_size = config.classes * config.groups
         self.encoder = JointEncoder(config, self.view)
@@ -131,6 +149,8 @@ class LatentFilter(nn.Module):
     def scaled(self, obs: Tensor) -> Tensor:
         """Observations as floats in the range that networks see and decoders predict."""
         obs = obs.to(self.gru.gates.weight.dtype)
+        if self.maxima is not None:
+            return obs / self.maxima
         return obs if self.view.scale == 1.0 else obs / self.view.scale
 
     def before(self, latent: Latent, actions: Tensor, is_first: Tensor) -> tuple[Latent, Tensor]:
@@ -206,6 +226,9 @@ class WorldModel(nn.Module):
         self.register_buffer("masks", masks, persistent=False)
         weights = torch.tensor(spec.event_weights).repeat(spec.num_players)
         self.register_buffer("event_weights", weights, persistent=False)
+        maxima = self.filter.maxima
+        binary = torch.tensor(self.filter.view.binary) if maxima is None else maxima == 1.0
+        self.register_buffer("binary", binary, persistent=False)
 
     def prior(self, h: Tensor) -> Tensor:
         """p(z | h) as probabilities (..., C, G)."""
@@ -236,6 +259,16 @@ class WorldModel(nn.Module):
         ]
         return torch.stack(views, dim=len(lead))
 
+    def observation_loss(self, decoded: Tensor, obs: Tensor) -> Tensor:
+        """-ln p(o | h, z) of both players (T, B), up to a constant; `decoded` and scaled `obs` (T, B, P, *shape).
+
+        Bernoulli for numbers that are 0 or 1; else a Gaussian, for channels of counts of deviation COUNT_DEVIATION.
+        """
+        maxima = self.filter.maxima
+        if maxima is None:
+            return reconstruction(decoded, obs, binary=self.filter.view.binary)
+        return reconstruction(decoded, obs, binary=self.binary, precision=(maxima / COUNT_DEVIATION).square())
+
     def event_logits(self, latent: Latent) -> Tensor:
         """(..., P * E), player-major."""
         return self.event_head(latent.flat())
@@ -258,22 +291,23 @@ class WorldModel(nn.Module):
     def set_output_biases(self, obs_mean: Tensor, event_mean: Tensor) -> None:
         """Start decoders and event head at the data's means: rare events need not be unlearned first.
 
-        obs_mean (P, *shape) and event_mean (P * E), in [0, 1].
+        obs_mean (P, *shape), of scaled observations, and event_mean (P * E), in [0, 1].
         """
-        if self.filter.view.binary and len(self.filter.view.shape) == 1:
-            for decoder, mean in zip(self.decoders, obs_mean, strict=True):
-                decoder.trunk[-1].bias.copy_(torch.logit(mean, eps=1e-3))
+        logits = torch.logit(obs_mean, eps=1e-3)
+        for decoder, bias in zip(self.decoders, torch.where(self.binary, logits, obs_mean), strict=True):
+            decoder.output.copy_(bias)
         self.event_head[-1].bias.copy_(torch.logit(event_mean, eps=1e-3))
         self.continue_head[-1].bias.fill_(4.0)
 
     def exact(self, decoded: Tensor, obs: Tensor) -> Tensor:
         """(...,) bool: every number of both players' observations is right after rounding."""
-        lead = decoded.dim() - 1 - len(self.filter.view.shape)
-        if self.filter.view.binary:
-            right = (decoded > 0.0) == (obs > 0.5)
-        else:
-            right = torch.round(decoded * self.filter.view.scale) == torch.round(obs * self.filter.view.scale)
-        return right.flatten(lead).all(-1)
+        view, lead = self.filter.view, decoded.dim() - 1 - len(self.filter.view.shape)
+        signs = (decoded > 0.0) == (obs > 0.5)
+        if view.binary:
+            return signs.flatten(lead).all(-1)
+        scale = view.scale if self.filter.maxima is None else self.filter.maxima
+        counts = torch.round(decoded * scale) == torch.round(obs * scale)
+        return torch.where(self.binary, signs, counts).flatten(lead).all(-1)
 
 
 def bernoulli_loss(logits: Tensor, target: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from small import AGENT, MODEL, kitchen, random_play
 
+from popgen.config import ACTING
 from popgen.nets import weights as w
 from popgen.policies.registry import build_policy
 from popgen.policies.world_model_policy import WorldModelPolicy
@@ -59,6 +60,48 @@ def test_parts_rebuild_it() -> None:
     config = json.loads(json.dumps(policy.config()))
     assert {name.partition(".")[0] for name in policy.weights()} == {"filter", "actor"}
     assert np.array_equal(play(build_policy("world_model", config, policy.weights(), SPEC)), play(policy))
+
+
+def test_fields_of_training_do_not_matter_to_a_saved_policy() -> None:
+    """A config of a version that trained otherwise: fields we do not know, and fields that we know gone or changed."""
+    policy = make_policy()
+    whole = {"world_model": MODEL.model_dump(mode="json"), "agent": AGENT.model_dump(mode="json")}
+    assert set(policy.config()["world_model"]) < set(whole["world_model"])
+    assert set(policy.config()["agent"]) < set(whole["agent"])
+    other = json.loads(json.dumps(whole))
+    other["agent"] |= {"lambda_warmup": 200, "lambda_xp": "strong", "actor_lr": -1}
+    other["world_model"] |= {"decoder_heads": 3, "batch": None}
+    other["curriculum"] = {}
+    del other["agent"]["horizon"], other["world_model"]["length"]
+    for config in (whole, other):
+        rebuilt = build_policy("world_model", config, policy.weights(), SPEC)
+        assert rebuilt.config() == policy.config() and np.array_equal(play(rebuilt), play(policy))
+
+
+FIELDS = [(section, name) for section, names in ACTING.items() for name in names]
+
+
+@pytest.mark.parametrize(("section", "name"), FIELDS)
+def test_a_field_that_decides_how_it_acts_must_be_there_and_right(section: str, name: str) -> None:
+    policy = make_policy()
+    config = policy.config()
+    config[section][name] = "wrong"
+    with pytest.raises(ValueError, match=rf"^{section}\.{name}: [^\n]*$"):
+        build_policy("world_model", config, policy.weights(), SPEC)
+    del config[section][name]
+    with pytest.raises(ValueError, match=rf"^{section}\.{name} is missing$"):
+        build_policy("world_model", config, policy.weights(), SPEC)
+
+
+def test_parts_without_a_section_are_refused() -> None:
+    policy = make_policy()
+    for config in ({"world_model": policy.config()["world_model"]}, {**policy.config(), "agent": [1]}):
+        with pytest.raises(ValueError, match="no 'agent'"):
+            build_policy("world_model", config, policy.weights(), SPEC)
+    groups = policy.config()
+    groups["world_model"]["joint_groups"] = groups["world_model"]["groups"]
+    with pytest.raises(ValueError, match=r"^world_model: joint_groups must leave"):
+        build_policy("world_model", groups, policy.weights(), SPEC)
 
 
 @pytest.mark.parametrize("change", ["missing", "unknown", "shape"])

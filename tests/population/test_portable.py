@@ -13,7 +13,7 @@ PROGRAM = """
 import sys
 
 BLOCKED = {"ray", "hydra", "omegaconf", "mlflow", "pettingzoo", "gymnasium", "matplotlib"}
-OURS = {"popgen.algos", "popgen.rllib", "popgen.tracking", "popgen.cli", "popgen.losses", "actors", "pipelines"}
+OURS = {"popgen.algos", "popgen.rllib", "popgen.tracking", "popgen.cli", "actors", "pipelines"}
 
 
 class Blocker:

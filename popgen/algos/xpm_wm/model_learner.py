@@ -95,7 +95,7 @@ class ModelLearner:
         )
         going_on = bernoulli_loss(model.continue_head(seen.latent.flat()).squeeze(-1), 1.0 - batch.terminal)
         terms = {
-            "observation": losses.reconstruction(decoded, batch.obs, binary=model.filter.view.binary).mean(),
+            "observation": model.observation_loss(decoded, batch.obs).mean(),
             "events": losses.masked_mean(losses.events(events, batch.events.flatten(2)), inner),
             "continue": going_on.mean(),
             "kl": losses.masked_mean(kl_loss, inner),

@@ -99,10 +99,9 @@ class OvercookedEnv(BatchedEnv):
             params["grid"] = "/".join(layout.rows)
             if layout.config:
                 params["rules"] = layout.config
-        longest = max(int(self.tables.meta[k.M_COOK]), self.rules.max_ingredients)
         views = {
             "features": ViewSpec((len(self.tables.feature_names),), "uint8", True, 1.0, self._swap()),
-            "lossless": ViewSpec((layout.width, layout.height, k.CHANNELS), "uint8", False, float(longest)),
+            "lossless": self._lossless_view(),
         }
         return EnvSpec(
             name=f"overcooked/{layout.name}",
@@ -118,6 +117,14 @@ class OvercookedEnv(BatchedEnv):
             params=params,
             fingerprint=self._fingerprint(soups),
         )
+
+    def _lossless_view(self) -> ViewSpec:
+        """Ingredients and steps left to cook are counts; all other channels are 0 or 1."""
+        maxima = np.ones(k.CHANNELS)
+        maxima[k.C_IN_POT : k.C_IN_SOUP + 2] = self.rules.max_ingredients
+        maxima[k.C_COOK] = max(1, int(self.tables.meta[k.M_COOK]))
+        shape = (self.layout.width, self.layout.height, k.CHANNELS)
+        return ViewSpec(shape, "uint8", False, float(maxima.max()), maxima=tuple(maxima.tolist()))
 
     def _swap(self) -> tuple[int, ...]:
         """Index array that turns one player's features into the other's."""
