@@ -105,13 +105,14 @@ class WorldModelConfig(Schema):
     @model_validator(mode="after")
     def _groups_divide(self) -> WorldModelConfig:
         if self.joint_groups >= self.groups or (self.groups - self.joint_groups) % 2:
-            raise ValueError("joint_groups must leave an even, positive number of groups for the two players")
+            problem = f"must leave an even, positive number of the {self.groups} groups for the two players"
+            raise UserError("joint_groups", problem, "lower it")
         return self
 
     @model_validator(mode="after")
     def _kernels_keep_the_grid(self) -> WorldModelConfig:
         if any(kernel % 2 == 0 for kernel in self.cnn_kernels):
-            raise ValueError("cnn_kernels must be odd, so that a convolution keeps the grid's size")
+            raise UserError("cnn_kernels", "must be odd, so that a convolution keeps the grid's size", "choose 3 or 5")
         return self
 
 
@@ -138,7 +139,7 @@ class AgentConfig(Schema):
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
     lambda_xp: Weight = 0.35
     lambda_start: Weight = 0.25
-    lambda_ramp: NonNegative = 1000
+    lambda_ramp: NonNegative = 2000
     sp_from_xp: Fraction = 0.5
     xp_starts: Literal["partner", "any"] = "partner"
     partner: Literal["max_window", "max_buffer"] = "max_window"
@@ -149,7 +150,8 @@ class AgentConfig(Schema):
     def _percentiles_are_a_range(self) -> AgentConfig:
         low, high = self.return_percentiles
         if not 0.0 <= low < high <= 100.0:
-            raise ValueError("return_percentiles must be two ascending numbers within [0, 100]")
+            problem = f"must be two ascending numbers within [0, 100] (got {low:g} and {high:g})"
+            raise UserError("return_percentiles", problem, "choose 5 and 95")
         return self
 
 
@@ -174,7 +176,7 @@ ACTING: dict[str, tuple[str, ...]] = {
 class ReplayConfig(Schema):
     """B_SP and B_XP."""
 
-    capacity: Annotated[_Int, Field(ge=1, le=2**31)] = 2_000_000
+    capacity: Positive = 2_000_000
     event_fraction: Fraction = 0.4
 
 
@@ -201,13 +203,13 @@ class Phase1Config(Schema):
 class Phase2Config(Schema):
     """Members 2..M: mostly imagination, few real episodes."""
 
-    first_updates: Positive = 400
-    updates_per_round: Positive = 150
-    model_updates: NonNegative = 60
+    first_updates: Positive = 600
+    updates_per_round: Positive = 350
+    model_updates: NonNegative = 100
     model_lr: Rate = 5e-4
     episodes_sp: Batch = 8
     episodes_xp: Batch = 8
-    rounds: Positive = 9
+    rounds: Positive = 8
     max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
     cache: Positive = 8192
     starts_random: Fraction = 0.6
@@ -219,7 +221,7 @@ class Phase2Config(Schema):
     @model_validator(mode="after")
     def _shares_of_starts(self) -> Phase2Config:
         if self.starts_random + self.starts_event > 1.0 + 1e-9:
-            raise ValueError("starts_random and starts_event must not exceed 1 together")
+            raise UserError("starts_random", "exceeds 1 together with starts_event", "lower one of them")
         return self
 
 
@@ -286,14 +288,17 @@ class RunConfig(Schema):
         phase, window = self.phase1, self.world_model.length + OPEN_LOOP
         prefill = min(PREFILL_CHUNK, phase.prefill_steps // phase.envs)
         if prefill < window:
-            raise ValueError(f"phase1.prefill_steps must be at least {window} in each of phase1.envs environments")
+            problem = f"gives each environment {prefill} steps, a window of the reports is {window}"
+            raise UserError("phase1.prefill_steps", problem, f"make it at least {window * phase.envs}")
         if phase.steps_per_iteration < window:
-            raise ValueError(f"phase1.steps_per_iteration must be at least world_model.length + {OPEN_LOOP} = {window}")
+            problem = f"is less than world_model.length + {OPEN_LOOP}, a window of the reports"
+            raise UserError("phase1.steps_per_iteration", problem, f"make it at least {window}")
         segment = phase.envs * max(prefill, phase.steps_per_iteration)
         if self.replay.capacity < segment:
-            raise ValueError(f"replay.capacity must hold the {segment:,} steps that phase1 adds at once")
+            problem = f"cannot hold the {segment:,} steps that phase1 adds at once"
+            raise UserError("replay.capacity", problem, "raise it or lower phase1.envs")
         if self.phase2.cache < 4 * self.world_model.length:
-            raise ValueError("phase2.cache must be at least four times world_model.length")
+            raise UserError("phase2.cache", "is less than four times world_model.length", "raise it")
         return self
 
     @classmethod
@@ -306,7 +311,7 @@ class RunConfig(Schema):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise _as_user_error(error) from None
+            raise as_user_error(error) from None
 
     def digest(self) -> str:
         """sha256 of everything that decides the result (not of where it runs or is tracked)."""
@@ -344,9 +349,14 @@ def unknown_field(key: str) -> UserError:
     return UserError(key, "there is no such field", f"did you mean {known}?" if known else "see `popgen run --dry-run`")
 
 
-def _as_user_error(error: ValidationError) -> UserError:
+def as_user_error(error: ValidationError, section: str = "") -> UserError:
+    """The first complaint of a schema in one line; `section` is the dotted name of where it stands."""
     first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"]) or "config"
+    parts = [section] * bool(section) + [str(part) for part in first["loc"]]
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, UserError):
+        return UserError(".".join([*parts, cause.field]), cause.problem, cause.fix)
+    where = ".".join(parts) or "config"
     if first["type"] == "extra_forbidden":
         return unknown_field(where)
     got = first.get("input")

@@ -75,6 +75,21 @@ def test_the_paper_preset_is_the_papers_table(layout: str) -> None:
     assert (model.learning_rate, agent.actor_lr, agent.critic_lr, agent.entropy) == (2e-4, 4e-5, 1e-4, 0.03)
     assert (agent.layers, agent.horizon, config.replay.capacity) == (5, 15, 1_000_000)
     assert config.phase1.steps_per_iteration == 50
+    assert config.env.params["cooking"] == "auto" and config.env.params["events"] == "dispenser"
+
+
+def test_the_paper_preset_has_nothing_of_the_laptops_recipe() -> None:
+    config = parsed("scale=paper")
+    model, agent, first, later = config.world_model, config.agent, config.phase1, config.phase2
+    assert (model.imagination, model.event_scale, model.continue_scale) == ("sample", 1.0, 1.0)
+    assert model.kl_predecessors > 0 and model.predecessors == "partner"
+    assert (agent.lambda_ramp, agent.partner, agent.partner_random) == (0, "max_window", 0.0)
+    assert (agent.actor_input, agent.sp_from_xp, agent.xp_starts) == ("model", 0.5, "partner")
+    assert config.replay.event_fraction == 0.0
+    assert (first.prefill_interact, first.pretrain_updates, first.recent_fraction) == (0.0, 1, 0.0)
+    assert (later.new_fraction, later.starts_new) == (1.0, 1.0)
+    assert (later.starts_random, later.starts_event, later.model_lr) == (0.0, 0.0, 2e-4)
+    assert later.first_updates == later.updates_per_round
 
 
 def test_overrides_win_over_the_papers_table() -> None:
@@ -119,6 +134,59 @@ def test_no_number_is_negative() -> None:
     for name in set(numeric_fields()) - {"phase1.target_score"}:
         with pytest.raises(UserError, match=re.escape(name)):
             RunConfig.parse(nested(name, -1))
+
+
+@pytest.mark.parametrize("name", sorted(numeric_fields()))
+def test_every_number_has_an_upper_bound(name: str) -> None:
+    with pytest.raises(UserError) as caught:
+        RunConfig.parse(nested(name, 10**18))
+    assert caught.value.field == name
+
+
+BOUNDS = {  # accepted, refused
+    "world_model.classes": ([2, 256], [1, 257, 300]),
+    "world_model.groups": ([18, 1024], [0, 1025, 10**9]),
+    "world_model.units": ([1, 16_384], [10**8]),
+    "world_model.deter": ([16_384], [16_385]),
+    "world_model.encoder_layers": ([64], [0, 65]),
+    "world_model.unimix": ([1e-6, 0.01], [0, 0.0]),
+    "agent.unimix": ([1e-6], [0.0]),
+    "world_model.length": ([2], [1, 2000]),
+    "world_model.cnn_kernels": ([[1], [7, 5], [5, 3, 3]], [[], [4], [3, 2], [1000], [33], [3] * 17, [3, None]]),
+    "agent.return_percentiles": ([[0, 100], [5.0, 95.0]], [[-5, 105], [95, 5], [5, 5], [0, 100.5], [5], [1, 2, 3]]),
+    "agent.starts_sp": ([100_000], [10**6]),
+    "phase1.envs": ([1, 1024], [10**8]),
+    "phase2.episodes_xp": ([1], [0, 10**9]),
+    "phase2.cache": ([32], [1, 31]),
+    "phase2.starts_random": ([0.0, 0.8], [0.81, 1.0]),
+    "phase1.prefill_steps": ([12 * 64], [1, 12 * 64 - 1]),
+    "phase1.steps_per_iteration": ([12], [1, 11]),
+    "replay.capacity": ([64 * 400], [1, 100, 64 * 400 - 1]),
+    "evaluation.episodes": ([1], [2 * 10**9]),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_bounds(name: str) -> None:
+    base = {"phase2": {"starts_event": 0.2}, "world_model": {"length": 8, "joint_groups": 16}}
+    base |= {"phase1": {"envs": 64, "prefill_steps": 256_000, "steps_per_iteration": 100}}
+    section, _, last = name.partition(".")
+    accepted, refused = BOUNDS[name]
+    for value in accepted:
+        config = RunConfig.parse({**base, section: {**base.get(section, {}), last: value}})
+        assert config.model_dump(mode="json")[section][last] == value
+    for value in refused:
+        with pytest.raises(UserError) as caught:
+            RunConfig.parse({**base, section: {**base.get(section, {}), last: value}})
+        assert re.sub(r"\.\d+$", "", caught.value.field) == name and "\n" not in str(caught.value), value
+
+
+def test_the_replays_must_hold_what_is_added_at_once() -> None:
+    """400 steps of random play or a longer iteration, in all environments."""
+    for phase1, steps in (({"envs": 10, "prefill_steps": 500}, 1000), ({"envs": 3, "steps_per_iteration": 700}, 2100)):
+        assert RunConfig.parse({"phase1": phase1, "replay": {"capacity": steps}}).replay.capacity == steps
+        with pytest.raises(UserError, match=rf"replay\.capacity: cannot hold the {steps:,} steps"):
+            RunConfig.parse({"phase1": phase1, "replay": {"capacity": steps - 1}})
 
 
 @pytest.mark.parametrize(

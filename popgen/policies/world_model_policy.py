@@ -10,7 +10,7 @@ import torch
 from pydantic import ValidationError
 from torch import nn
 
-from popgen.config import ACTING, AgentConfig, Schema, WorldModelConfig
+from popgen.config import ACTING, AgentConfig, Schema, WorldModelConfig, as_user_error
 from popgen.envs.base import EnvSpec
 from popgen.nets import weights as w
 from popgen.nets.actor_critic import Actor
@@ -57,6 +57,18 @@ class WorldModelPolicy:
             seats = torch.tensor([0, 1]).expand(len(is_first), 2)
             return self.actor.sample(pair, seats, self._generator).numpy().astype(np.uint8)
 
+    def memory(self) -> dict[str, Any]:
+        """The running episodes' latents and the generator; see `popgen.policies.base.Remembering`."""
+        if self._latent is None:
+            raise RuntimeError("there is no memory before reset")
+        latent = {"h": self._latent.h.numpy(), "z": self._latent.z.numpy()}
+        return latent | {"generator": self._generator.get_state().numpy()}
+
+    def load_memory(self, memory: dict[str, Any]) -> None:
+        """Go on from `memory()`."""
+        self._latent = Latent(*(torch.from_numpy(np.array(memory[name])) for name in ("h", "z")))
+        self._generator.set_state(torch.from_numpy(np.array(memory["generator"])))
+
     def config(self) -> dict[str, Any]:
         """The fields of the two schemas that the networks are built from."""
         return {
@@ -99,6 +111,4 @@ def _acting(config: Mapping[str, Any], section: str, schema: type[_S]) -> _S:
     try:
         return schema.model_validate({name: given[name] for name in ACTING[section]})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in (section, *first["loc"]))
-        raise ValueError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
+        raise as_user_error(error, section) from None

@@ -100,7 +100,7 @@ def test_parts_without_a_section_are_refused() -> None:
             build_policy("world_model", config, policy.weights(), SPEC)
     groups = policy.config()
     groups["world_model"]["joint_groups"] = groups["world_model"]["groups"]
-    with pytest.raises(ValueError, match=r"^world_model: joint_groups must leave"):
+    with pytest.raises(ValueError, match=r"^world_model\.joint_groups: must leave"):
         build_policy("world_model", groups, policy.weights(), SPEC)
 
 
