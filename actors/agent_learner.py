@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 
@@ -35,8 +36,8 @@ class AgentActor:
 
     def train(
         self, updates: int, model: Weights, starts: Starts, new_share: float, partner_scores: dict[int, float]
-    ) -> tuple[Weights, dict[str, float]]:
-        """Imagine and update `updates` times; acting weights (filter and actor) and mean metrics."""
+    ) -> tuple[Weights, Weights, dict[str, float]]:
+        """Imagine and update `updates` times; acting weights (filter and actor), critics and mean metrics."""
         began = time.perf_counter()
         self.learner.set_model(model)
         self.learner.set_starts(starts, new_share)
@@ -47,12 +48,16 @@ class AgentActor:
                 totals[name].append(value)
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["seconds"] = time.perf_counter() - began
-        return self.acting_weights(model), means
+        return self.acting_weights(model), weights_of(self.learner.critics), means
 
     def acting_weights(self, model: Weights) -> Weights:
         """Policy weights: the filter of `model` and this member's actor."""
         return prefixed("filter", under("filter", model)) | prefixed("actor", self.learner.actor_weights())
 
-    def critics(self) -> Weights:
-        """Critic weights by partner, for the member's training file."""
-        return weights_of(self.learner.critics)
+    def state(self) -> dict[str, Any]:
+        """Of the learner: everything but the world model and the start states, which come with every call."""
+        return self.learner.state()
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from `state()`, after `begin_member` with the same partners."""
+        self.learner.load_state(state)

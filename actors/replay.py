@@ -40,6 +40,15 @@ class ReplayActor:
         """Contents, counters and generator."""
         return {"replay": self.replay.state(), "seen": sorted([list(key) for key in self.seen]), "turn": self.turn}
 
+    def marks(self) -> dict[str, Any]:
+        """What `state` holds beside the contents: small enough for every iteration."""
+        return {"rng": self.replay.rng.bit_generator.state, "turn": self.turn}
+
+    def load_marks(self, marks: dict[str, Any]) -> None:
+        """Draw on from `marks()`, with contents that were added again."""
+        self.replay.rng.bit_generator.state = marks["rng"]
+        self.turn = int(marks["turn"])
+
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from `state()`."""
         self.replay.load_state(state["replay"])

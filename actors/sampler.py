@@ -49,13 +49,26 @@ class SamplerActor:
         policies = {member: build_policy(p.kind, p.config, p.weights, env.spec) for member, p in parts.items()}
         self.sampler = Sampler(env, teams, policies, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence)
 
-    def collect(self, steps: int, load: dict[int, Weights] | None = None) -> tuple[list[Segment], Collected]:
-        """Play `steps` joint steps, with new weights for the given members; segments and their counts."""
+    def collect(
+        self, steps: int, member: int | None = None, weights: Weights | None = None
+    ) -> tuple[list[Segment], Collected]:
+        """Play `steps` joint steps, with new weights for one member if given; segments and their counts."""
         if self.sampler is None:
             raise RuntimeError("open before collect")
-        for member, weights in (load or {}).items():
+        if member is not None and weights is not None:
             self.sampler.policies[member].load(weights)
         segments, episodes = self.sampler.collect(steps)
         self.sequence = self.sampler.sequence
         counts = [(s.kind, s.members, s.sequence, s.steps) for s in segments]
         return segments, Collected(self.name, counts, episodes)
+
+    def state(self) -> dict[str, Any]:
+        """The running episodes and the number of the next segment."""
+        return {"sequence": self.sequence, "sampler": self.sampler.state() if self.sampler else None}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from `state()`, after `open` with the same teams."""
+        self.sequence = int(state["sequence"])
+        if state["sampler"] is not None and self.sampler is not None:
+            self.sampler.load_state(state["sampler"])
+            self.sampler.sequence = self.sequence

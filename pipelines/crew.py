@@ -13,6 +13,7 @@ from actors.common import options
 from actors.model_learner import ModelActor
 from actors.replay import ReplayActor
 from actors.sampler import SamplerActor
+from pipelines.play import Players
 from popgen.config import ClusterConfig, RunConfig
 
 
@@ -39,7 +40,7 @@ def start_ray(cluster: ClusterConfig) -> bool:
 class Crew:
     """Handles of one run's actors."""
 
-    samplers: list[Any]
+    players: Players
     replay_sp: Any
     replay_xp: Any
     model: Any
@@ -54,10 +55,12 @@ class Crew:
         model = ray.remote(ModelActor).options(**options(cluster, cluster.model_cpus, cluster.model_gpus))
         agent = ray.remote(AgentActor).options(**options(cluster, cluster.agent_cpus, cluster.agent_gpus))
         crew = Crew(
-            samplers=[
-                sampler.remote(config.env, f"sampler{index}.{attempt}", cluster.threads)
-                for index in range(cluster.samplers)
-            ],
+            players=Players(
+                [
+                    sampler.remote(config.env, f"sampler{index}.{attempt}", cluster.threads)
+                    for index in range(cluster.samplers)
+                ]
+            ),
             replay_sp=replay.remote(config.env, config.replay.capacity, seed * 1000 + 11),
             replay_xp=replay.remote(config.env, config.replay.capacity, seed * 1000 + 12),
             model=model.remote(config, seed * 1000 + 21, cluster.threads),
@@ -68,5 +71,5 @@ class Crew:
 
     def dismiss(self) -> None:
         """End all actors."""
-        for actor in (*self.samplers, self.replay_sp, self.replay_xp, self.model, self.agent):
+        for actor in (*self.players.samplers, self.replay_sp, self.replay_xp, self.model, self.agent):
             ray.kill(actor)

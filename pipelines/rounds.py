@@ -19,7 +19,13 @@ Finish = Callable[[Any], None]
 
 
 def run_rounds(
-    work: dict[str, tuple[Start, Finish]], *, stop: Callable[[], bool], after: Callable[[], None], schedule: str
+    work: dict[str, tuple[Start, Finish]],
+    *,
+    stop: Callable[[], bool],
+    after: Callable[[], None],
+    schedule: str,
+    due: Callable[[], bool] = lambda: False,
+    save: Callable[[], None] = lambda: None,
 ) -> dict[str, int]:
     """Work until `stop()`; every task that was started is also finished.
 
@@ -28,6 +34,8 @@ def run_rounds(
         stop: asked before a round (sync) or a task (async) is started.
         after: called after each round, that is, whenever the slowest kind has advanced.
         schedule: "sync" or "async".
+        due, save: whether to save, asked after each round, and how; nothing is at work when `save` is called, which
+            in `async` means that all kinds come to a halt first.
 
     Returns:
         Finished tasks per kind.
@@ -42,10 +50,27 @@ def run_rounds(
                 finish(results[name])
                 done[name] += 1
             after()
+            if due():
+                save()
         return done
+    return _overlapping(work, done, stop, after, due, save)
+
+
+def _overlapping(
+    work: dict[str, tuple[Start, Finish]],
+    done: dict[str, int],
+    stop: Callable[[], bool],
+    after: Callable[[], None],
+    due: Callable[[], bool],
+    save: Callable[[], None],
+) -> dict[str, int]:
     running: dict[str, Any] = {}
+    saving = False
     while True:
-        if not stop():
+        if saving and not running:
+            save()
+            saving = False
+        if not saving and not stop():
             for name, (start, _) in work.items():
                 if name not in running and done[name] <= min(done.values()) + AHEAD:
                     running[name] = start()
@@ -58,6 +83,7 @@ def run_rounds(
             done[name] += 1
         if min(done.values()) > rounds:
             after()
+            saving = saving or due()
 
 
 def _last(reference: Any) -> Any:

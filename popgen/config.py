@@ -262,7 +262,7 @@ class RunSection(Schema):
     root: str = "runs"
     seed: Annotated[_Int, Field(ge=0, lt=2**31)] = 0
     schedule: Literal["sync", "async"] = "sync"
-    checkpoint_seconds: Weight = 60.0
+    checkpoint_seconds: Weight = 0.0  # least time between two; 0: after every iteration
 
 
 class RunConfig(Schema):

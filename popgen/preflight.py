@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from popgen.config import SHAPES, RunConfig
+from popgen.config import OPEN_LOOP, SHAPES, RunConfig
 from popgen.envs.base import EnvSpec
 from popgen.envs.registry import make_env
 from popgen.errors import UserError
@@ -27,11 +27,13 @@ def preflight(config: RunConfig) -> None:
     """Refuse a run that cannot go well.
 
     Raises:
-        UserError: an environment that cannot be built, a view it does not have, a population to start from that is not
-            of this environment, an unsafe run id, a root that cannot be written, or too little disk or memory.
+        UserError: an environment that cannot be built or pays nothing for events, a view it does not have, windows or
+            buffers of a size that does not fit it, a population to start from that is not of this environment, an
+            unsafe run id, a root that cannot be written, or too little disk or memory.
     """
     spec = _build(config)
     _check_view(config, spec)
+    _check_rewards(config, spec)
     check_run_id(config.run.id)
     _check_lengths(config, spec)
     if config.tracking.enabled:
@@ -52,9 +54,9 @@ def check_run_id(name: str | None) -> None:
 
 
 def buffer_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Bytes of the two full replay buffers: a state, actions, events and some 24 bytes of marks for each step."""
+    """Bytes of the two full replay buffers: a state, actions, events and 15 bytes of marks for each step."""
     state = spec.state_size * np.dtype(spec.state_dtype).itemsize
-    return 2 * config.replay.capacity * (state + spec.num_players * (1 + spec.num_events) + 24)
+    return 2 * config.replay.capacity * (state + spec.num_players * (1 + spec.num_events) + 15)
 
 
 def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
@@ -113,12 +115,22 @@ def _check_view(config: RunConfig, spec: EnvSpec) -> None:
         )
 
 
+def _check_rewards(config: RunConfig, spec: EnvSpec) -> None:
+    """The imagined reward is made of events alone."""
+    if not any(spec.event_weights):
+        problem = f"{config.method} needs an environment with weighted events, {spec.name} has none"
+        raise UserError("env.name", problem, "choose another environment")
+
+
 def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
-    if config.world_model.length > spec.horizon:
-        problem = (
-            f"windows of {config.world_model.length} steps are longer than an episode of {spec.name} ({spec.horizon})"
-        )
-        raise UserError("world_model.length", problem, "shorten them")
+    window, phase = config.world_model.length + OPEN_LOOP, config.phase2
+    if window > spec.horizon:
+        problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
+        raise UserError("world_model.length", f"{problem} ({spec.horizon})", "shorten them")
+    added = max(phase.episodes_sp, phase.episodes_xp) * (spec.horizon + 1)
+    if config.replay.capacity < added:
+        problem = f"cannot hold the {added:,} steps that phase2 adds at once"
+        raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
 
 
 def _check_start(config: RunConfig, spec: EnvSpec) -> None:
@@ -163,6 +175,11 @@ def _check_sizes(config: RunConfig, run: Path) -> None:
             there, here = part.get(name), ours[section][name]
             if there != here:
                 raise UserError(f"{section}.{name}", f"is {here!r}, but {there!r} in {run}", "use the same sizes")
+    replay = known.get("replay")
+    held = replay.get("capacity") if isinstance(replay, dict) else None
+    if isinstance(held, int) and config.replay.capacity < held:
+        problem = f"is {config.replay.capacity:,}, but the buffers of {run} may hold {held:,} steps"
+        raise UserError("replay.capacity", problem, "raise it")
 
 
 def _gib(size: int) -> str:

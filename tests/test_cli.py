@@ -97,12 +97,21 @@ BAD_OVERRIDES = {
     "unknown view": (["world_model.view=smell"], "world_model.view"),
     "view that the environment lacks": (["env=rendezvous/mppmr", "world_model.view=lossless"], "world_model.view"),
     "windows longer than an episode": (["env.params.horizon=5"], "world_model.length"),
+    "no room for open-loop steps": (["env.params.horizon=11"], "world_model.length"),
+    "buffers smaller than a round": (["phase2.episodes_sp=6000"], "replay.capacity"),
+    "buffers smaller than a segment": (["replay.capacity=100"], "replay.capacity"),
+    "random play too short for a window": (["phase1.prefill_steps=1"], "phase1.prefill_steps"),
+    "hardly any start states": (["phase2.cache=1"], "phase2.cache"),
+    "even kernel": (["world_model.cnn_kernels=[4,3]"], "world_model.cnn_kernels"),
+    "percentiles the wrong way round": (["agent.return_percentiles=[95,5]"], "agent.return_percentiles"),
+    "probabilities of zero": (["agent.unimix=0"], "agent.unimix"),
+    "an environment that rewards no event": (["env=rendezvous/mppmr"], "xpm_wm needs an environment with weighted"),
     "landmarks out of bounds": (["env=rendezvous/mppmr", "env.params.landmark_distance=9"], "env.params.landmark"),
     "run id that leaves the root": (["run.id=../elsewhere"], "run.id"),
     "run id that is a path": (["run.id=/tmp/x"], "run.id"),
     "empty run id": (["run.id=''"], "run.id"),
     "root below a file": (["run.root=file/runs"], "run.root"),
-    "buffers larger than memory": (["replay.capacity=1e13"], "replay.capacity"),
+    "buffers larger than memory": (["replay.capacity=1e12"], "replay.capacity"),
     "tracking without a server": (["tracking=server"], "tracking.uri"),
     "tracking to nothing": (["tracking=server", "tracking.uri=http://127.0.0.1:9"], "tracking.uri"),
     "tracking to a folder": (["tracking.uri=mlruns"], "tracking.uri"),
@@ -225,6 +234,7 @@ def test_a_start_is_compared_by_its_own_config_which_may_be_of_another_version(
     assert run(*DRY, *start)[0] == 0
     for name in ("decoder_layers", "prior_layers", "head_layers"):  # none of them in the members' own records
         refused(run("run", *start, f"world_model.{name}=7"), f"world_model.{name}", "is 7, but 1")
+    refused(run("run", *start, "replay.capacity=19999"), "replay.capacity", "20,000")
     for content in ("", "[]", '{"world_model": 1}'):
         path.write_text(content)
         refused(run("run", *start), "population.init_from", "config.json")
@@ -305,6 +315,7 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
     environment = {"name": "overcooked/cramped_room"}
     evaluation = {"environment": environment, "unit": "dishes", "members": [1, 2], "sp": figure, "xp": figure}
     evaluation["matrix"] = {"mean": [[9.0, 0.25], [None, 8.0]], "standard_error": [[0.5, 0.1], [None, 0.1]]}
+    evaluation["beside"] = {"random": {"both": figure}, "idle": {"both": figure}}
     result["evaluation"] = evaluation
 
     def fake(config: Any, *, reporter: Any) -> dict[str, Any]:

@@ -89,7 +89,9 @@ def test_the_paper_preset_has_nothing_of_the_laptops_recipe() -> None:
     assert (first.prefill_interact, first.pretrain_updates, first.recent_fraction) == (0.0, 1, 0.0)
     assert (later.new_fraction, later.starts_new) == (1.0, 1.0)
     assert (later.starts_random, later.starts_event, later.model_lr) == (0.0, 0.0, 2e-4)
-    assert later.first_updates == later.updates_per_round
+    intervals = config.env.params["horizon"] // first.steps_per_iteration
+    assert first.model_updates == first.agent_updates
+    assert later.first_updates == later.updates_per_round == later.model_updates == intervals * first.agent_updates
 
 
 def test_overrides_win_over_the_papers_table() -> None:

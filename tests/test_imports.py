@@ -11,7 +11,7 @@ from conftest import ROOT
 
 # A room may import the rooms above it in this list, never one below.
 ORDER = (
-    *("types", "shapes", "errors", "progress", "config"),
+    *("types", "shapes", "errors", "jsonable", "progress", "config"),
     *("envs", "nets", "losses"),
     *("tracking", "world_model", "policies", "data"),
     "population",

@@ -60,7 +60,10 @@ def test_members_are_nested_in_the_parent(tracked: Tracker) -> None:
     assert parent.info.run_name == "run-1" and parent.info.status == "FINISHED"
     assert all(run.data.tags["mlflow.parentRunId"] == parent.info.run_id for run in runs.values())
     assert all(run.info.status == "FINISHED" for run in runs.values())
-    assert parent.data.params["agent.lambda_xp"] == "0.25" and parent.data.params["env.name"] == RunConfig().env.name
+    assert (
+        parent.data.params["agent.lambda_xp"] == str(RunConfig().agent.lambda_xp)
+        and parent.data.params["env.name"] == RunConfig().env.name
+    )
 
 
 def test_metrics_of_both_sittings_are_there(tracked: Tracker) -> None:

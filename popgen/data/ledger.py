@@ -67,7 +67,7 @@ class Ledger:
         if not self._keep(entry):
             return False
         if self.path is not None:
-            self._pending.append(json.dumps(asdict(entry)) + "\n")
+            self._pending.append(_line(entry))
         return True
 
     def flush(self) -> None:
@@ -90,6 +90,36 @@ class Ledger:
                 file.truncate(before)
                 raise
         self._pending.clear()
+
+    def cut(self, count: int) -> int:
+        """Keep the first `count` entries: the work behind the others was lost, and will be done again.
+
+        They are set aside in `NAME.lost.jsonl` beside the file. Returns how many they were.
+
+        Raises:
+            ValueError: there are fewer than `count` entries.
+        """
+        entries = list(self._entries.values())
+        if count > len(entries):
+            raise ValueError(f"ledger: cannot keep {count} of {len(entries)} entries")
+        lost = entries[count:]
+        if not lost:
+            return 0
+        self.flush()
+        if self.path is not None:
+            with open(self.path.with_suffix(".lost.jsonl"), "a") as file:
+                file.writelines(_line(entry) for entry in lost)
+            fresh = self.path.with_suffix(".writing")
+            with open(fresh, "w") as file:
+                file.writelines(_line(entry) for entry in entries[:count])
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self.path)
+        self._entries.clear()
+        self._totals.clear()
+        for entry in entries[:count]:
+            self._keep(entry)
+        return len(lost)
 
     def steps(self, member: int | None = None, kind: Kind | str | None = None) -> int:
         """Environment steps, of one member, of one kind, or of all."""
@@ -154,6 +184,10 @@ class Ledger:
                 fix = "restore the file from a copy, or start a new run"
                 raise UserError("ledger", f"{path} line {number} is no ledger entry ({error})", fix) from None
             self._keep(entry)
+
+
+def _line(entry: LedgerEntry) -> str:
+    return json.dumps(asdict(entry)) + "\n"
 
 
 _FIELDS = {field.name for field in fields(LedgerEntry)}

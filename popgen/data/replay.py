@@ -58,11 +58,11 @@ class Replay:
 
     Args:
         env: encodes states; its own episode is not touched.
-        capacity: rows; memory is about (S + 2 + P * E + 16) bytes each.
+        capacity: rows; each takes the bytes of a state and 2 + P * E + 15 more.
         seed: of the sampling generator.
     """
 
-    COLUMNS = ("states", "actions", "events", "first", "terminal", "stream", "owner", "partner", "kind", "age")
+    COLUMNS = ("states", "actions", "events", "first", "terminal", "stream", "owner", "partner", "kind")
 
     def __init__(self, env: BatchedEnv, capacity: int, seed: int) -> None:
         spec = env.spec
@@ -79,7 +79,6 @@ class Replay:
         self.owner = np.zeros(capacity, np.int16)
         self.partner = np.zeros(capacity, np.int16)
         self.kind = np.zeros(capacity, np.uint8)
-        self.age = np.zeros(capacity, np.int64)
 
     def add(self, segment: Segment, owner: int) -> None:
         """Store every environment of a segment as a stream of its own."""
@@ -107,7 +106,6 @@ class Replay:
         self.stream[rows] = self.streams
         self.owner[rows], self.partner[rows] = owner, partner
         self.kind[rows] = KIND_CODE[segment.kind]
-        self.age[rows] = np.arange(self.added, self.added + len(rows))
         self.streams += 1
         self.added += len(rows)
 
@@ -126,24 +124,29 @@ class Replay:
         """Row numbers that match (and at which a window can show `event`), oldest first; cached until the next add."""
         key = (query, event)
         if key not in self._cache:
-            match = self.stream[: self.size] >= 0
-            if query.owner is not None:
-                owner = self.owner[: self.size]
-                match = match & (owner == query.owner if query.owner_is == "equal" else owner < query.owner)
-            if query.kind is not None:
-                match = match & (self.kind[: self.size] == KIND_CODE[query.kind])
-            if query.partner is not None:
-                match = match & (self.partner[: self.size] == query.partner)
-            found = np.flatnonzero(match)
-            found = found[np.argsort(self.age[found], kind="stable")]
-            kept = int(np.ceil(len(found) * query.recent))
-            found = found[len(found) - (kept if query.last is None else min(kept, query.last)) :]
-            if event is not None:
-                found = found[self.events[found, :, event].any(1)]
-                # A window shows an event at the state it led to, which is not stored where an episode was cut.
-                found = found[self._whole(found, 2) & ~self.first[(found + 1) % self.capacity]]
-            self._cache[key] = found
+            self._cache[key] = self._matching(query) if event is None else self._showing(self.rows(query), event)
         return self._cache[key]
+
+    def _matching(self, query: Query) -> np.ndarray:
+        match = self.stream[: self.size] >= 0
+        if query.owner is not None:
+            owner = self.owner[: self.size]
+            match &= owner == query.owner if query.owner_is == "equal" else owner < query.owner
+        if query.kind is not None:
+            match &= self.kind[: self.size] == KIND_CODE[query.kind]
+        if query.partner is not None:
+            match &= self.partner[: self.size] == query.partner
+        found = np.flatnonzero(match)
+        wrapped = int(np.searchsorted(found, self.head))  # rows from the head on are the ring's oldest
+        found = np.concatenate([found[wrapped:], found[:wrapped]])
+        kept = int(np.ceil(len(found) * query.recent))
+        return found[len(found) - (kept if query.last is None else min(kept, query.last)) :]
+
+    def _showing(self, found: np.ndarray, event: int) -> np.ndarray:
+        """Those of the rows at which a window can show the event."""
+        found = found[self.events[found, :, event].any(1)]
+        # A window shows an event at the state it led to, which is not stored where an episode was cut.
+        return found[self._whole(found, 2) & ~self.first[(found + 1) % self.capacity]]
 
     def sample(
         self, batch: int, length: int, query: Query, *, event_fraction: float = 0.0, turn: int = 0
@@ -227,8 +230,14 @@ class Replay:
         return {"arrays": arrays, "counters": counters}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Undo nothing, take over `state()` of another replay of at most this capacity."""
+        """Undo nothing, take over `state()` of another replay.
+
+        Raises:
+            ValueError: it holds more rows than this one's capacity.
+        """
         arrays, counters = state["arrays"], state["counters"]
+        if len(arrays["stream"]) > self.capacity:
+            raise ValueError(f"{len(arrays['stream'])} rows do not fit a replay of {self.capacity}")
         self.size = len(arrays["stream"])
         for name in self.COLUMNS:
             getattr(self, name)[: self.size] = arrays[name]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,24 @@ class Team:
     kind: Kind
     members: tuple[int, int]
     envs: int
+
+
+def split_teams(teams: list[Team], parts: int) -> list[list[Team]]:
+    """Cut the batch of environments that the teams fill into `parts`, as even as possible and in order.
+
+    Sizes differ by one at most, the larger ones first; with fewer environments than parts the last ones are empty.
+    """
+    total = sum(team.envs for team in teams)
+    bounds = np.cumsum([0] + [total // parts + (part < total % parts) for part in range(parts)])
+    shares: list[list[Team]] = [[] for _ in range(parts)]
+    begin = 0
+    for team in teams:
+        end = begin + team.envs
+        for share, low, high in zip(shares, bounds[:-1], bounds[1:], strict=True):
+            if (envs := int(min(end, high) - max(begin, low))) > 0:
+                share.append(replace(team, envs=envs))
+        begin = end
+    return shares
 
 
 @dataclass(frozen=True)
@@ -74,6 +93,24 @@ class Sampler:
         self._score = np.zeros(count)
         self._counts = np.zeros((count, 2, env.spec.num_events), np.int64)
         self._weights = np.asarray(env.spec.event_weights)
+
+    def state(self) -> dict[str, Any]:
+        """Everything to go on from exactly here, except teams and weights."""
+        return {
+            "env": self.env.get_state(),
+            "generator": self.env.generator_state(),
+            "seating": self.seating.state(),
+            "whole": self._whole.copy(),
+            "score": self._score.copy(),
+            "counts": self._counts.copy(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from `state()` of a sampler of the same teams."""
+        self.env.set_state(state["env"])
+        self.env.load_generator_state(state["generator"])
+        self.seating.load_state(state["seating"])
+        self._whole, self._score, self._counts = (np.array(state[name]) for name in ("whole", "score", "counts"))
 
     def collect(self, steps: int) -> tuple[list[Segment], list[Episode]]:
         """Play `steps` joint steps: one segment per team, and the episodes that ended."""

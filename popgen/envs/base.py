@@ -129,6 +129,15 @@ class BatchedEnv(ABC):
     def render_rgb(self, index: int = 0) -> np.ndarray:
         """The state of one environment as an (H, W, 3) uint8 picture."""
 
+    def generator_state(self) -> dict[str, Any]:
+        """What, beside the states, decides how these environments go on (JSON-able); empty where nothing is drawn."""
+        return {}
+
+    def load_generator_state(self, state: dict[str, Any]) -> None:
+        """Draw on from `generator_state()`; raises ValueError for a state that is not of this environment."""
+        if state:
+            raise ValueError("this environment draws nothing")
+
     def observe(self, view: str = "features") -> np.ndarray:
         """Observations (B, P, *view.shape) of the current states."""
         return self.encode(self.get_state(), view)

@@ -234,6 +234,14 @@ class RendezvousEnv(BatchedEnv):
         check(states, (rows.size, STATE_SIZE), "states")
         self._states[rows] = states
 
+    def generator_state(self) -> dict[str, Any]:
+        """Of the generator of start positions."""
+        return self._rng.bit_generator.state
+
+    def load_generator_state(self, state: dict[str, Any]) -> None:
+        """Draw on from `generator_state()`."""
+        self._rng.bit_generator.state = state
+
     def encode(self, states: np.ndarray, view: str = "features") -> np.ndarray:
         """Features (..., P, 25) float32 of states (..., S); raises ValueError on another view."""
         if view not in self.spec.views:

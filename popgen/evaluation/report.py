@@ -28,7 +28,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -145,51 +145,70 @@ def to_csv(result: CrossPlayResult) -> str:
     return text.getvalue()
 
 
-def shown(estimate: Estimate, digits: int = 2) -> str:
-    """`mean ± standard error` as text; `-` for what was not played."""
-    if math.isnan(estimate.mean):
+def figure_text(figure: Mapping[str, float | None], digits: int = 2) -> str:
+    """`mean ± standard error` of a figure of the JSON object; `-` for what was not played."""
+    mean, error = figure["mean"], figure["standard_error"]
+    if mean is None:
         return "-"
-    error = "" if math.isnan(estimate.error) else f" ± {estimate.error:.{digits}f}"
-    return f"{estimate.mean:.{digits}f}{error}"
+    return f"{mean:.{digits}f}" + ("" if error is None else f" ± {error:.{digits}f}")
+
+
+def shown(estimate: Estimate, digits: int = 2) -> str:
+    """`figure_text` of an estimate."""
+    return figure_text(_figure(estimate), digits)
 
 
 def summary(result: CrossPlayResult) -> list[str]:
     """The headline figures, a line of plain text each."""
-    unit = result.environment.score_name
-    lines = [f"SP mean {shown(result.sp)} {unit}", f"XP mean {shown(result.xp)} {unit}"]
+    return summary_lines(to_dict(result))
+
+
+def summary_lines(report: Mapping[str, Any]) -> list[str]:
+    """The headline figures of the JSON object, a line of plain text each."""
+    unit, beside, low = report["unit"], report["beside"], report["obstruction"]
+    lines = [f"SP mean {figure_text(report['sp'])} {unit}", f"XP mean {figure_text(report['xp'])} {unit}"]
     for partner in PARTNERS:
-        parts = ", ".join(f"partner in seat {seat} {shown(result.beside(partner, seat))}" for seat in (0, 1))
-        lines.append(f"beside {partner} {shown(result.beside(partner))} {unit} ({parts})")
-    low = [partner for partner, flag in result.obstruction.items() if flag]
-    if low:
-        lines.append(f"obstruction: XP is below play beside {' and '.join(low)} partners")
-    pairs = sorted({o.pair for o in result.obstructions})
+        row = beside[partner]
+        parts = ", ".join(f"partner in seat {seat} {figure_text(row[f'seat_{seat}'])}" for seat in (0, 1))
+        lines.append(f"beside {partner} {figure_text(row['both'])} {unit} ({parts})")
+    blocked = [partner for partner in PARTNERS if low[partner]]
+    if blocked:
+        lines.append(f"obstruction: XP is below play beside {' and '.join(blocked)} partners")
+    pairs = sorted({tuple(found["pair"]) for found in low["pairs"]})
     if pairs:
         named = ", ".join(f"{i}-{j}" for i, j in pairs)
         lines.append(f"pairs (seat 0-seat 1) worse than a random or idle partner: {named}")
-    lines.append(f"{result.episodes} episodes per pair, {result.steps:,} environment steps")
+    lines.append(f"{report['episodes']} episodes per pair, {report['steps']['evaluation']:,} environment steps")
     return lines
 
 
-def _rows(result: CrossPlayResult) -> tuple[list[str], list[list[str]]]:
-    labels: Sequence[str] = (*result.labels, RANDOM, IDLE)
-    return ["seat 0 \\ seat 1", *labels], [[row, *(shown(result.score(row, c)) for c in labels)] for row in labels]
+def _rows(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    members = [str(member) for member in report["members"]]
+    labels = (*members, RANDOM, IDLE)
+    scores = {(pair["seat_0"], pair["seat_1"]): figure_text(pair["score"]) for pair in report["pairs"]}
+    return ["seat 0 \\ seat 1", *labels], [[row, *(scores[row, column] for column in labels)] for row in members]
 
 
 def to_markdown(result: CrossPlayResult) -> str:
     """A Markdown table of scores and the headline figures."""
-    head, rows = _rows(result)
+    report = to_dict(result)
+    head, rows = _rows(report)
     escaped = [head[0].replace("\\", "\\\\"), *head[1:]]
     lines = ["| " + " | ".join(escaped) + " |", "|" + " --- |" * len(head)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
-    title = f"{result.environment.name}: {result.environment.score_name} per episode, mean ± standard error"
-    return "\n".join([title, "", *lines, "", *(f"- {line}" for line in summary(result))]) + "\n"
+    title = f"{report['environment']['name']}: {report['unit']} per episode, mean ± standard error"
+    return "\n".join([title, "", *lines, "", *(f"- {line}" for line in summary_lines(report))]) + "\n"
 
 
 def to_rich(result: CrossPlayResult) -> Table:
-    """The matrix as a table for the terminal, self-play in bold."""
-    head, rows = _rows(result)
-    table = Table(title=f"{result.environment.name}: {result.environment.score_name} per episode (± standard error)")
+    """`matrix_table` of a result."""
+    return matrix_table(to_dict(result))
+
+
+def matrix_table(report: Mapping[str, Any]) -> Table:
+    """The matrix of the JSON object as a table for the terminal, self-play in bold."""
+    head, rows = _rows(report)
+    table = Table(title=f"{report['environment']['name']}: {report['unit']} per episode (± standard error)")
     table.add_column(head[0].replace(" \\ ", "\n\\ "), style="bold")
     for label in head[1:]:
         table.add_column(label, justify="right")

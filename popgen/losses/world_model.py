@@ -14,26 +14,20 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return (values * mask).sum() / mask.sum().clamp(min=1.0)
 
 
-def reconstruction(
-    outputs: Tensor, target: Tensor, *, binary: bool | Tensor, precision: float | Tensor = 1.0
-) -> Tensor:
-    """-ln p(o | h, z), up to a constant: Bernoulli where binary, Gaussian elsewhere. (T, B, ..., K) -> (T, B).
+def reconstruction(outputs: Tensor, target: Tensor, *, binary: bool, largest: Tensor | None = None) -> Tensor:
+    """-ln p(o | h, z), up to a constant. (T, B, ...) -> (T, B).
 
     Args:
-        outputs: logits where binary, means elsewhere.
-        binary: of the whole view, or (K,) bool of each of its channels.
-        precision: 1 / variance of the Gaussian, of the whole view or (K,).
+        outputs: logits of Bernoulli variables and counts if `binary`, else means of Gaussians of variance 1.
+        target: for counts, their share of the largest count, whose logit is then the output.
+        largest: largest counts (1 for a Bernoulli variable), broadcast to the outputs; None if all are 1. A count
+            weighs as its root: as a Binomial one of n trials it would weigh n, and drown the variables beside it.
     """
-    if isinstance(binary, Tensor):
-        one, other = binary.nonzero().squeeze(-1), (~binary).nonzero().squeeze(-1)
-        if isinstance(precision, Tensor):
-            precision = precision[other]
-        first = reconstruction(outputs[..., one], target[..., one], binary=True)
-        return first + reconstruction(outputs[..., other], target[..., other], binary=False, precision=precision)
     if binary:
         loss = F.binary_cross_entropy_with_logits(outputs, target, reduction="none")
+        loss = loss if largest is None else largest.sqrt() * loss
     else:
-        loss = 0.5 * precision * (outputs - target).square()
+        loss = 0.5 * (outputs - target).square()
     return loss.flatten(2).sum(-1)
 
 

@@ -62,7 +62,14 @@ class NormGRUCell(nn.Module):
         return hidden + update * (candidate - hidden)
 
 
-def _conv(kind: type[nn.Conv2d] | type[nn.ConvTranspose2d], inputs: int, outputs: int, kernel: int, bias: bool = True):
+def _conv(
+    kind: type[nn.Conv2d] | type[nn.ConvTranspose2d],
+    inputs: int,
+    outputs: int,
+    kernel: int,
+    *,
+    bias: bool = True,
+) -> nn.Module:
     """Same-padded convolution with the initial weights of `linear`: default ones let the signal fade."""
     layer = kind(inputs, outputs, kernel, padding=kernel // 2, bias=bias)
     deviation = math.sqrt(2.0 / ((inputs + outputs) * kernel**2))
@@ -98,7 +105,7 @@ class ConvEncoder(nn.Module):
 class ConvDecoder(nn.Module):
     """Transposed convolutions back to a grid view. (B, inputs) -> (B, W, H, K).
 
-    The bias of the output is of its own for every cell: walls and dispensers never move.
+    The bias of the output is of its own for every cell, since walls and dispensers never move.
     """
 
     def __init__(

@@ -11,6 +11,17 @@ from popgen.envs.base import EnvSpec
 
 
 @runtime_checkable
+class Remembering(Protocol):
+    """A policy that keeps something from step to step, which a checkpoint of running episodes must hold."""
+
+    def memory(self) -> dict[str, Any]:
+        """Everything since `reset` that the next actions depend on, the generator included: arrays and plain values."""
+
+    def load_memory(self, memory: dict[str, Any]) -> None:
+        """Go on from `memory()` of a policy with the same weights and batch."""
+
+
+@runtime_checkable
 class Policy(Protocol):
     """A player that looks at the joint observation and answers for every seat.
 

@@ -55,7 +55,7 @@ class OvercookedAgent(Agent):
         super().set_agent_index(agent_index)
 
     def set_mdp(self, mdp: Any) -> None:
-        """Accept the game that will be played.
+        """Accept the game that will be played; `to_overcooked_mdp` makes the one of an environment.
 
         Raises:
             UserError: another layout or cooking mode than the environment's.
@@ -68,7 +68,7 @@ class OvercookedAgent(Agent):
         cooking = "auto" if getattr(mdp, "old_dynamics", False) else "interact"
         if cooking != self._env.cooking:
             problem = f"its cooking mode is {cooking}, the environment's is {self._env.cooking}"
-            raise UserError("mdp", problem, "set old_dynamics to match, or choose a population of its mode")
+            raise UserError("mdp", problem, "make it with popgen.envs.overcooked.bridge.to_overcooked_mdp")
         super().set_mdp(mdp)
 
     def action(self, state: Any) -> tuple[Any, dict[str, Any]]:

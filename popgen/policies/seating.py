@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from popgen.policies.base import Policy
+from popgen.policies.base import Policy, Remembering
 from popgen.shapes import check
 
 
@@ -73,3 +74,17 @@ class Seating:
     def ended(self, done: np.ndarray) -> None:
         """Mark the rows (B,) bool that were reset: their next step is the first of an episode."""
         self._first = np.asarray(done, bool).copy()
+
+    def state(self) -> dict[str, Any]:
+        """Everything to go on from exactly here: last actions, first steps and the policies' memories."""
+        memories = {str(k): self.policies[k].memory() for k in self._remembering()}
+        return {"actions": self._actions.copy(), "first": self._first.copy(), "memories": memories}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state()` of the same seats and policies."""
+        self._actions, self._first = np.array(state["actions"]), np.array(state["first"])
+        for k in self._remembering():
+            self.policies[k].load_memory(state["memories"][str(k)])
+
+    def _remembering(self) -> list[int]:
+        return [k for k, _ in self._rows if isinstance(self.policies[k], Remembering)]

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from importlib.metadata import version
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 import popgen
 from popgen.envs.base import EnvSpec
+from popgen.jsonable import jsonable
 from popgen.types import Kind
 
 FORMAT = "popgen-population"
@@ -168,18 +167,3 @@ def cooking_of(spec: EnvSpec) -> str | None:
     """The environment's cooking mode, None where it has none."""
     cooking = spec.params.get("cooking")
     return None if cooking is None else str(cooking)
-
-
-def jsonable(value: Any) -> Any:
-    """`value` with numpy numbers and arrays as plain ones, tuples as lists and numbers that are not finite as None."""
-    if isinstance(value, dict):
-        return {str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, list | tuple):
-        return [jsonable(item) for item in value]
-    if isinstance(value, np.generic):
-        return jsonable(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

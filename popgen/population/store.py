@@ -12,6 +12,7 @@ import numpy as np
 
 from popgen.envs import BatchedEnv, EnvSpec, make_env
 from popgen.errors import UserError
+from popgen.jsonable import jsonable
 from popgen.policies.base import Policy
 from popgen.policies.registry import build_policy
 from popgen.population import files
@@ -25,7 +26,6 @@ from popgen.population.manifest import (
     Versions,
     cooking_of,
     folder_name,
-    jsonable,
 )
 
 MANIFEST, MEMBER, POLICY, TRAINING = "manifest.json", "member.json", "policy.safetensors", "training.safetensors"

@@ -27,9 +27,6 @@ from popgen.nets.blocks import ConvDecoder, ConvEncoder, NormGRUCell, mlp
 from popgen.nets.latents import Latent
 from popgen.shapes import check
 
-COUNT_DEVIATION = 0.5
-"""Standard deviation, in counts, of the decoder's Gaussian over a channel of counts: neighbours are told apart."""
-
 
 @dataclass(frozen=True)
 class Observed:
@@ -44,7 +41,10 @@ class Observed:
 
 
 class JointEncoder(nn.Module):
-    """Both players' observations (B, P, *shape) -> embedding (B, units)."""
+    """Both players' observations (B, P, *shape) -> embedding (B, units).
+
+    Grid views are centred first (`center`, see `WorldModel.set_outputs`): what never changes would fill the layers.
+    """
 
     def __init__(self, config: WorldModelConfig, view: ViewSpec) -> None:
         super().__init__()
@@ -60,11 +60,13 @@ class JointEncoder(nn.Module):
                 norm=config.norm,
             )
             inputs = self.conv.features
+            self.register_buffer("center", torch.zeros(2, *view.shape))
         self.trunk = mlp(inputs, None, **_style(config), layers=config.encoder_layers)
 
     def forward(self, obs: Tensor) -> Tensor:
         if self.conv is None:
             return self.trunk(obs.flatten(1))
+        obs = obs - self.center
         return self.trunk(self.conv(torch.cat([obs[:, 0], obs[:, 1]], -1)))
 
 
@@ -226,9 +228,7 @@ class WorldModel(nn.Module):
         self.register_buffer("masks", masks, persistent=False)
         weights = torch.tensor(spec.event_weights).repeat(spec.num_players)
         self.register_buffer("event_weights", weights, persistent=False)
-        maxima = self.filter.maxima
-        binary = torch.tensor(self.filter.view.binary) if maxima is None else maxima == 1.0
-        self.register_buffer("binary", binary, persistent=False)
+        self.logits = self.filter.view.binary or self.filter.maxima is not None
 
     def prior(self, h: Tensor) -> Tensor:
         """p(z | h) as probabilities (..., C, G)."""
@@ -251,7 +251,7 @@ class WorldModel(nn.Module):
         return torch.cat([latent.h, latent.z * self.masks[player]], -1)
 
     def decode(self, latent: Latent) -> Tensor:
-        """Both players' observations, logits for binary views: (..., P, *shape)."""
+        """Both players' observations, logits for binary views and counts: (..., P, *shape)."""
         lead = latent.h.shape[:-1]
         views = [
             decoder(self.player_latent(latent, player).flatten(0, -2)).unflatten(0, lead)
@@ -262,12 +262,9 @@ class WorldModel(nn.Module):
     def observation_loss(self, decoded: Tensor, obs: Tensor) -> Tensor:
         """-ln p(o | h, z) of both players (T, B), up to a constant; `decoded` and scaled `obs` (T, B, P, *shape).
 
-        Bernoulli for numbers that are 0 or 1; else a Gaussian, for channels of counts of deviation COUNT_DEVIATION.
+        Bernoulli where all is 0 or 1; the same of n / N for counts n of at most N; else Gaussian.
         """
-        maxima = self.filter.maxima
-        if maxima is None:
-            return reconstruction(decoded, obs, binary=self.filter.view.binary)
-        return reconstruction(decoded, obs, binary=self.binary, precision=(maxima / COUNT_DEVIATION).square())
+        return reconstruction(decoded, obs, binary=self.logits, largest=self.filter.maxima)
 
     def event_logits(self, latent: Latent) -> Tensor:
         """(..., P * E), player-major."""
@@ -288,26 +285,30 @@ class WorldModel(nn.Module):
         return torch.sigmoid(self.continue_head(latent.flat())).squeeze(-1)
 
     @torch.no_grad()
-    def set_output_biases(self, obs_mean: Tensor, event_mean: Tensor) -> None:
-        """Start decoders and event head at the data's means: rare events need not be unlearned first.
+    def set_outputs(self, obs: Tensor, events: Tensor) -> None:
+        """Start decoders and event head at the data's means: rare events need not be unlearned first. Centre grids.
 
-        obs_mean (P, *shape), of scaled observations, and event_mean (P * E), in [0, 1].
+        Scaled obs (T, B, P, *shape) and events (T, B, P * E) in [0, 1].
         """
-        logits = torch.logit(obs_mean, eps=1e-3)
-        for decoder, bias in zip(self.decoders, torch.where(self.binary, logits, obs_mean), strict=True):
+        obs_mean, event_mean = obs.mean((0, 1)), events.mean((0, 1))
+        biases = torch.logit(obs_mean, eps=1e-3) if self.logits else obs_mean
+        for decoder, bias in zip(self.decoders, biases, strict=True):
             decoder.output.copy_(bias)
+        if self.filter.encoder.conv is not None:
+            self.filter.encoder.center.copy_(obs_mean)
         self.event_head[-1].bias.copy_(torch.logit(event_mean, eps=1e-3))
         self.continue_head[-1].bias.fill_(4.0)
 
     def exact(self, decoded: Tensor, obs: Tensor) -> Tensor:
         """(...,) bool: every number of both players' observations is right after rounding."""
         view, lead = self.filter.view, decoded.dim() - 1 - len(self.filter.view.shape)
-        signs = (decoded > 0.0) == (obs > 0.5)
         if view.binary:
-            return signs.flatten(lead).all(-1)
-        scale = view.scale if self.filter.maxima is None else self.filter.maxima
-        counts = torch.round(decoded * scale) == torch.round(obs * scale)
-        return torch.where(self.binary, signs, counts).flatten(lead).all(-1)
+            right = (decoded > 0.0) == (obs > 0.5)
+        else:
+            scale = view.scale if self.filter.maxima is None else self.filter.maxima
+            means = torch.sigmoid(decoded) if self.logits else decoded
+            right = torch.round(means * scale) == torch.round(obs * scale)
+        return right.flatten(lead).all(-1)
 
 
 def bernoulli_loss(logits: Tensor, target: Tensor) -> Tensor:

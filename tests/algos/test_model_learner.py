@@ -196,6 +196,23 @@ def test_the_learning_rate_of_later_members() -> None:
     assert max(np.abs(value - before[name]).max() for name, value in w.weights_of(learner.model).items()) < 1e-6
 
 
+@pytest.mark.parametrize("broken", ["events", "gradient"])
+def test_an_update_that_is_not_finite_is_told_at_once_and_changes_nothing(broken: str) -> None:
+    learner, windows = make_learner(), random_windows(6, 5)
+    learner.update(windows)
+    bias = learner.model.event_head[-1].bias
+    if broken == "events":
+        bias.data[0] = float("nan")
+    else:
+        bias.register_hook(lambda gradient: gradient * float("inf"))
+    before = w.weights_of(learner.model)
+    message = rf"^{broken} not finite in update 2 of the world model, at a learning rate of 0\.002$"
+    with pytest.raises(FloatingPointError, match=message):
+        learner.update(windows)
+    after = w.weights_of(learner.model)
+    assert learner.updates == 1 and all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
+
+
 def test_starts_are_posterior_states_that_are_neither_terminal_nor_first() -> None:
     learner, windows = make_learner(), crossed(random_windows(6, 5), PARTNERS)
     windows.terminal[1, 2] = windows.terminal[4, 4] = True

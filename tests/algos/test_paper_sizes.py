@@ -1,16 +1,23 @@
-"""The networks that `scale=paper` builds, against the paper's table of XPM-WM hyper-parameters."""
+"""What `scale=paper` builds and draws, against the paper's table of XPM-WM hyper-parameters and its algorithm 1."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from popgen.algos.xpm_wm.agent_learner import AgentLearner
+from popgen.algos.xpm_wm.recipe import model_batch, start_batch
+from popgen.algos.xpm_wm.starts import NEW_SP, NEW_XP, OLD, Starts, draw_cross_play, draw_self_play
 from popgen.cli import compose
 from popgen.config import RunConfig
+from popgen.data.replay import Query
 from popgen.envs import make_env
+from popgen.types import Kind
 from popgen.world_model.model import WorldModel
+
+SMALL = ["world_model.units=8", "world_model.deter=8", "agent.units=8", "agent.layers=1"]
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +79,43 @@ def test_agent(config: RunConfig, model: WorldModel) -> None:
     rates = [group["lr"] for group in (*agent.actor_optimiser.param_groups, *agent.critic_optimiser.param_groups)]
     assert rates == [4e-5, 1e-4]
     assert (agent.config.horizon, agent.config.entropy, agent.config.lambda_xp) == (15, 0.03, 0.25)
+
+
+@pytest.mark.parametrize(("layout", "wanted"), [("cramped_room", 0.25), ("counter_circuit_o_1order", 0.1)])
+def test_lambda_is_the_tables_from_the_first_update_on(layout: str, wanted: float) -> None:
+    config = RunConfig.parse(compose(["scale=paper", f"env=overcooked/{layout}", *SMALL]))
+    agent = AgentLearner(config.agent, config.world_model, make_env(config.env.name, 1).spec, member=2, seed=0)
+    for updates in (0, 1, 10, 10_000):
+        agent.updates = updates
+        assert agent.lambda_now() == wanted
+
+
+def starts(pool: int, partner: int, count: int = 50) -> Starts:
+    h, z = np.zeros((count, 4), np.float32), np.zeros((count, 2), np.uint8)
+    return Starts(h, z, np.full(count, pool, np.uint8), np.full(count, partner, np.int16))
+
+
+def test_starts_are_half_self_play_half_cross_play_and_cross_play_is_that_partners(config: RunConfig) -> None:
+    pools = [starts(OLD, 0), starts(NEW_SP, 0), starts(NEW_XP, 1), starts(NEW_XP, 2)]
+    every, rng = Starts.concat(pools), np.random.default_rng(0)
+    share, from_xp = config.phase2.starts_new, config.agent.sp_from_xp
+    own = draw_self_play(every, 20_000, share, from_xp, rng)
+    shares = np.bincount(every.pool[own], minlength=3) / len(own)
+    np.testing.assert_allclose(shares, [0.0, 0.5, 0.5], atol=0.02)
+    cross = draw_cross_play(every, 1000, share, 2, rng)
+    assert set(every.pool[cross]) == {NEW_XP} and set(every.partner[cross]) == {2}
+    unmet = draw_cross_play(Starts.concat(pools[:3]), 1000, share, 2, rng)
+    assert set(every.pool[unmet]) == {OLD}, "states of another partner do not stand in"
+
+
+def test_batches_are_drawn_evenly_and_of_the_members_own_play(config: RunConfig, model: WorldModel) -> None:
+    first = model_batch(config, 1)
+    assert [(r.query, r.count, r.event_fraction) for r in first.sp] == [(Query(), config.world_model.batch, 0.0)]
+    later = model_batch(config, 3)
+    drawn = {name: [r for r in getattr(later, name) if r.count] for name in ("sp", "xp")}
+    assert all(r.query.owner == 3 and r.query.owner_is == "equal" for found in drawn.values() for r in found)
+    assert all(r.event_fraction == 0.0 for found in drawn.values() for r in found)
+    assert [sum(r.count for r in found) for found in drawn.values()] == [config.world_model.batch // 2] * 2
+    beginning = start_batch(config, model.spec, 2, 100)
+    old = [r for r in (*beginning.sp, *beginning.xp) if r.pool == OLD and r.count]
+    assert [(r.query.kind, r.events) for r in old] == [(Kind.SP, ())], "neither random play nor chosen moments"

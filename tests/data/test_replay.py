@@ -308,6 +308,27 @@ def test_a_restored_replay_goes_on_identically(capacity: int) -> None:
     assert (replay.added, replay.streams, replay.head) == (restored.added, restored.streams, restored.head)
 
 
+def test_a_ring_goes_on_in_a_larger_one_and_not_in_a_smaller_one() -> None:
+    history = History(13)
+    for _ in range(15):
+        history.random_segment()
+    replay = filled(history, 70)
+    assert replay.added > 2 * 70 and replay.head < replay.size
+    state = replay.state()
+    with pytest.raises(ValueError, match="do not fit a replay of 40"):
+        Replay(Numbers(), 40, 0).load_state(state)  # type: ignore[arg-type]
+    larger = Replay(Numbers(), 90, 0)  # type: ignore[arg-type]
+    larger.load_state(state)
+    for _ in range(20):
+        before = states_of(larger, larger.rows(Query()))
+        segment, owner = history.segment(4, 1, 1, (1, 1), Kind.SP)
+        larger.add(segment, owner)
+        after = states_of(larger, larger.rows(Query()))
+        new = [row.state for row in history.streams[-1].rows]
+        kept = after[: -len(new)]
+        assert after[-len(new) :] == new and kept == before[len(before) - len(kept) :]
+
+
 def test_its_state_is_a_copy() -> None:
     history = History(11)
     history.segment(20, 1, 1, (1, 1), Kind.SP)

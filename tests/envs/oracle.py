@@ -1,7 +1,7 @@
 """Compares popgen's Overcooked with overcooked_ai step by step: `python -m tests.envs.oracle --steps 20000`.
 
 overcooked_ai's own classes give states, rewards, events and the lossless encoding; automatic cooking, which version
-1.1.0 lacks, is added to them below as later versions have it (`old_dynamics`).
+1.1.0 lacks, is added to them as later versions have it (`popgen.envs.overcooked.bridge.AutomaticGridworld`).
 """
 
 from __future__ import annotations
@@ -9,21 +9,17 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from contextlib import redirect_stderr
 from dataclasses import dataclass, field
-from io import StringIO
 from typing import Any
 
 import numpy as np
+from overcooked_ai_py.mdp.actions import Action
+from overcooked_ai_py.mdp.overcooked_mdp import OvercookedGridworld
 
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.envs.overcooked import kernels as k
-from popgen.envs.overcooked.bridge import from_overcooked_ai, to_overcooked_ai
+from popgen.envs.overcooked.bridge import AutomaticGridworld, from_overcooked_ai, to_overcooked_ai
 from tests.envs.cooks import Cook, Kitchen
-
-with redirect_stderr(StringIO()):  # gym, which overcooked_ai imports, prints that it is no longer maintained
-    from overcooked_ai_py.mdp.actions import Action
-    from overcooked_ai_py.mdp.overcooked_mdp import OvercookedGridworld
 
 LAYOUTS = (
     "cramped_room",
@@ -35,19 +31,6 @@ LAYOUTS = (
 MODES = ("auto", "interact")
 GAMES = 8
 RANDOMNESS = (0.1, 0.1, 0.1, 0.1, 0.25, 0.25, 0.5, 1.0)  # of the cooks of each game; 1 plays at random
-
-
-class AutomaticGridworld(OvercookedGridworld):
-    """A full pot begins to cook by itself; an empty-handed interact does nothing."""
-
-    def soup_to_be_cooked_at_location(self, state: Any, pos: tuple[int, int]) -> bool:
-        return False
-
-    def step_environment_effects(self, state: Any) -> None:
-        for thing in state.objects.values():
-            if thing.name == "soup" and thing.is_idle and len(thing.ingredients) == 3:
-                thing.begin_cooking()
-        super().step_environment_effects(state)
 
 
 @dataclass

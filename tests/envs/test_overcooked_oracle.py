@@ -9,7 +9,7 @@ import pytest
 
 from popgen.envs.overcooked import OvercookedEnv, layout_names
 from popgen.envs.overcooked import kernels as k
-from popgen.envs.overcooked.bridge import from_overcooked_ai, infer_joint_action, to_overcooked_ai
+from popgen.envs.overcooked.bridge import from_overcooked_ai, infer_joint_action, to_overcooked_ai, to_overcooked_mdp
 from tests.envs.oracle import LAYOUTS, MODES, Comparison, OvercookedGridworld
 
 STEPS = int(os.environ.get("POPGEN_ORACLE_STEPS", "20000"))
@@ -53,6 +53,33 @@ def test_a_grid_given_as_text():
     # without orders every recipe pays 20
     assert report.events.min() >= 5 and report.unpaid == 0
     assert report.reward == 20 * report.events[k.DELIVERS_SOUP]
+
+
+RULES = {
+    "start_all_orders": [{"ingredients": ["onion"] * 3}, {"ingredients": ["onion", "tomato", "tomato"]}],
+    "start_bonus_orders": [{"ingredients": ["onion"] * 3}],
+    "recipe_values": [10, 30],
+    "cook_time": 7,
+}
+TWO = {"start_all_orders": [{"ingredients": ["onion", "onion"]}]}
+GAMES = {
+    "by name": ("cramped_room", {}),
+    "orders and a bonus": ("counter_circuit", {}),
+    "a start state": ("tutorial_1", {}),
+    "a grid": ("mine", {"grid": "XPXXPX/O1 X T/X  X2X/XD XSX/XXXXXX"}),
+    "a grid and rules": ("mine", {"grid": "XPXPX/O1 2T/X   X/XDXSX", "rules": RULES}),
+    "soups of two": ("mine", {"grid": "XPXPX/O1 2T/X   X/XDXSX", "rules": {"max_num_ingredients": 2, **TWO}}),
+}
+
+
+@pytest.mark.parametrize("cooking", MODES)
+@pytest.mark.parametrize("game", GAMES)
+def test_the_game_that_is_made_of_an_environment_is_its_game(game, cooking):
+    name, params = GAMES[game]
+    mdp = to_overcooked_mdp(OvercookedEnv(name, 1, cooking=cooking, **params))
+    assert getattr(mdp, "old_dynamics", False) == (cooking == "auto")
+    report = Comparison(name, cooking, 5, mdp=mdp, **params).run(3200)
+    assert report.events[k.POTS_INGREDIENT] > 10 and report.events[k.DELIVERS_SOUP] > 2
 
 
 @pytest.mark.parametrize("horizon", [30, 400, 1000])

@@ -70,6 +70,20 @@ def test_markdown_and_terminal_show_the_matrix(result: CrossPlayResult, alone: C
     assert "126.00" in out.getvalue() and max(map(len, out.getvalue().splitlines())) <= 80
 
 
+def test_table_and_summary_can_be_made_of_the_json_alone(result: CrossPlayResult, alone: CrossPlayResult) -> None:
+    for each in (result, alone):
+        told = json.loads(report.to_json(each))
+        assert report.summary_lines(told) == report.summary(each)
+        texts = []
+        for table in (report.matrix_table(told), report.to_rich(each)):
+            out = io.StringIO()
+            Console(file=out, width=80).print(table)
+            texts.append(out.getvalue())
+        assert texts[0] == texts[1] and "idle" in texts[0]
+    assert report.figure_text({"mean": 1.25, "standard_error": None}, digits=1) == "1.2"
+    assert report.figure_text({"mean": None, "standard_error": None}) == "-"
+
+
 def test_summary_names_obstruction() -> None:
     helpful, blocking = Script([TWO]), Script([STAY])
     got = evaluate_population(Cast(helpful, blocking), 20, 0)  # type: ignore[arg-type]

@@ -47,7 +47,7 @@ def test_gru_by_hand() -> None:
 
 
 def test_convolutions_keep_the_grid() -> None:
-    shape, options = (5, 4, 6), {"channels": 3, "kernels": (5, 3, 3), "activation": "silu"}
+    shape, options = (5, 4, 6), {"channels": 3, "kernels": (5, 3, 3), "activation": "silu", "norm": False}
     encoder = ConvEncoder(shape, **options)
     assert encoder(torch.rand(7, *shape)).shape == (7, encoder.features) and encoder.features == 3 * 5 * 4
     assert ConvDecoder(11, shape, **options)(torch.rand(7, 11)).shape == (7, *shape)
@@ -55,7 +55,7 @@ def test_convolutions_keep_the_grid() -> None:
 
 def test_the_convolutional_encoder_keeps_places_apart() -> None:
     torch.manual_seed(0)
-    encoder = ConvEncoder((5, 4, 1), channels=2, kernels=(3,), activation="silu")
+    encoder = ConvEncoder((5, 4, 1), channels=2, kernels=(3,), activation="silu", norm=False)
     grid = torch.zeros(2, 5, 4, 1)
     grid[0, 0, 3], grid[1, 4, 0] = 1.0, 1.0
     features = encoder(grid).unflatten(-1, (2, 5, 4)) - encoder(torch.zeros(1, 5, 4, 1)).unflatten(-1, (2, 5, 4))

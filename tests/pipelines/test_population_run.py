@@ -15,10 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
+from local_crew import LocalCrew
 
 from actors.sampler import Collected
 from pipelines import population as pipeline
 from pipelines.books import Books
+from pipelines.checkpoints import Checkpoints
+from pipelines.later_member import LaterMember
 from pipelines.population import run_population
 from popgen.cli import compose
 from popgen.config import RunConfig
@@ -59,8 +62,8 @@ def sha256s(run: Run) -> list[str]:
     return [info.policy_sha256 for info in run.population.members]
 
 
-class Interrupted(RuntimeError):
-    """Injected after member 1 is complete."""
+class Killed(RuntimeError):
+    """Injected where a driver could be killed."""
 
 
 @pytest.fixture(scope="module")
@@ -86,44 +89,53 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
-    """`scale=smoke` with two members and short episodes."""
+    """`scale=smoke` with two members, the second of two rounds, and short episodes."""
     base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
-    return RunConfig.parse(compose([*base, f"run.root={root}", f"run.id={name}", *overrides]))
+    base += ["phase2.rounds=2", f"run.root={root}", f"run.id={name}"]
+    return RunConfig.parse(compose([*base, *overrides]))
 
 
-def launch(root: Path, name: str, *overrides: str) -> Run:
-    """Run it, listening to what the samplers say."""
+def launch(root: Path, name: str, *overrides: str, local: bool = True, die_at: str = "") -> Run:
+    """Run it, listening to what the samplers say; without processes of its own if `local`.
+
+    die_at: METHOD:N of the books or the checkpoints; the run dies at the beginning of the N-th call of it.
+    """
     config = smoke(root, name, *overrides)
     collected: list[tuple[int, Collected]] = []
+    method, _, number = die_at.partition(":")
+    calls: Counter[str] = Counter()
+
+    def called(name: str) -> None:
+        calls[name] += 1
+        if name == method and calls[name] == int(number):
+            raise Killed(die_at)
 
     class Listening(Books):
         def record(self, member: int, said: Collected) -> None:
+            called("record")
             collected.append((member, said))
             super().record(member, said)
 
+        def add_member(self, *given: Any, **named: Any) -> None:
+            called("add_member")
+            super().add_member(*given, **named)
+
+    class Mortal(Checkpoints):
+        def save(self, *given: Any) -> None:
+            called("save")
+            super().save(*given)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "Books", Listening)
+        patch.setattr(pipeline, "Checkpoints", Mortal)
+        if local:
+            patch.setattr(pipeline, "Crew", LocalCrew)
         return Run(run_population(config, reporter=NullReporter()), collected)
 
 
 @pytest.fixture(scope="module")
 def whole(cluster: None, root: Path) -> Run:
-    return launch(root, "whole")
-
-
-@pytest.fixture(scope="module")
-def resumed(cluster: None, root: Path) -> Run:
-    """The same seed once more, interrupted after member 1 and started again under the same id."""
-
-    def stop(*_: Any) -> None:
-        raise Interrupted
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline.Driver, "train_later", stop)
-        with pytest.raises(Interrupted):
-            launch(root, "resumed")
-    assert len(load_population(root / "resumed" / "population")) == 1
-    return launch(root, "resumed")
+    return launch(root, "whole", local=False)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +146,7 @@ def continued(whole: Run, root: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def overlapped(cluster: None, root: Path) -> Run:
-    return launch(root, "overlapped", "run.schedule=async", "population.size=1")
+    return launch(root, "overlapped", "run.schedule=async", "population.size=1", "cluster.samplers=3", local=False)
 
 
 def check_ledger(run: Run) -> None:
@@ -213,24 +225,66 @@ def test_metrics_tell_what_training_did(whole: Run) -> None:
         assert wanted <= names and {"event_recall_step1", "event_precision_step4", "exact_posterior"} <= names
 
 
-def test_the_same_seed_gives_the_same_ledger_and_the_same_weights_even_when_interrupted(
-    whole: Run, resumed: Run
-) -> None:
-    assert sha256s(resumed) == sha256s(whole) and len(set(sha256s(whole))) == 2
-    assert resumed.ledger() == whole.ledger()
+DEATHS = {
+    "in the random play": ("record:1", 0),
+    "before the first checkpoint": ("save:1", 1),
+    "in the first round of member 1": ("record:2", 0),
+    "before the checkpoint of its third round": ("save:4", 1),
+    "when member 1 is added": ("add_member:1", 0),
+    "in the first round of member 2": ("record:6", 0),
+    "before the checkpoint of that": ("save:6", 3),
+    "when member 2 is added": ("add_member:2", 3),
+}
+"""Where a run dies, and how many ledger entries no checkpoint holds then. The calls of a smoke run are: random play; a
+checkpoint; four rounds of one entry, each with a checkpoint; two rounds of three entries, with one between them."""
 
 
-def test_a_resumed_run_trains_only_what_was_missing(resumed: Run) -> None:
-    assert {member for member, _ in resumed.collected} == {2}
-    assert len((resumed.dir / "attempts.txt").read_text().splitlines()) == 2
-    ledger = Ledger(resumed.dir / "ledger.jsonl")
-    assert {entry.sampler for entry in ledger if entry.member == 1} == {"sampler0.1"}
-    assert {entry.sampler for entry in ledger if entry.member == 2} == {"sampler0.2", "evaluation.2"}
+@pytest.mark.parametrize("death", DEATHS)
+def test_a_killed_run_ends_as_one_that_was_not(death: str, whole: Run, root: Path) -> None:
+    name, (die_at, lost) = death.replace(" ", "_"), DEATHS[death]
+    with pytest.raises(Killed):
+        launch(root, name, die_at=die_at)
+    run = launch(root, name)
+    assert sha256s(run) == sha256s(whole) and len(set(sha256s(whole))) == 2
+    assert run.ledger() == whole.ledger()
+    assert len((run.dir / "attempts.txt").read_text().splitlines()) == 2
+    aside = run.dir / "ledger.lost.jsonl"
+    assert (len(Ledger(aside)) if aside.exists() else 0) == lost
 
 
-def test_a_run_id_belongs_to_one_configuration(resumed: Run, root: Path) -> None:
-    with pytest.raises(UserError, match="resumed exists with another config"):
-        launch(root, "resumed", "agent.lambda_xp=0.125")
+def test_a_ring_that_is_full_is_restored_from_a_whole_copy(cluster: None, root: Path) -> None:
+    small = ("replay.capacity=1700", "population.size=1")
+    unbroken = launch(root, "unbroken_ring", *small)
+    with pytest.raises(Killed):
+        launch(root, "ring", *small, die_at="save:4")
+    names = {path.name for path in (root / "ring" / "checkpoints").iterdir()}
+    assert names == {"progress", "base_000001", "segments_000001", "segments_000002", "segments_000003"}
+    assert sha256s(launch(root, "ring", *small)) == sha256s(unbroken)
+
+
+def test_a_damaged_checkpoint_is_told_in_one_line(whole: Run, root: Path) -> None:
+    with pytest.raises(Killed):
+        launch(root, "damaged", die_at="save:3")
+    segments = root / "damaged" / "checkpoints" / "segments_000001"
+    whole_file = segments.read_bytes()
+    segments.write_bytes(whole_file[:100])
+    with pytest.raises(UserError, match="segments_000001"):
+        launch(root, "damaged")
+    segments.write_bytes(whole_file)
+    with pytest.raises(UserError, match=r"cluster.samplers: 2, but the checkpoint is of 1"):
+        launch(root, "damaged", "cluster.samplers=2")
+
+
+def test_a_checkpoint_waits_for_its_time(cluster: None, root: Path) -> None:
+    with pytest.raises(Killed):
+        launch(root, "seldom", "run.checkpoint_seconds=3600", die_at="record:4")
+    state = load_state(root / "seldom" / "checkpoints" / "progress")
+    assert state["first_member"]["counters"][0] == 0  # that before the rounds
+
+
+def test_a_run_id_belongs_to_one_configuration(whole: Run, root: Path) -> None:
+    with pytest.raises(UserError, match="whole exists with another config"):
+        launch(root, "whole", "agent.lambda_xp=0.125")
 
 
 def test_a_run_can_go_on_from_a_member_of_another(whole: Run, continued: Run) -> None:
@@ -257,7 +311,8 @@ def test_a_run_that_goes_on_from_another_can_be_interrupted_before_its_first_own
         driver = pipeline.Driver(config, whole.population.spec, books, NullReporter())
         with monkeypatch.context() as patch:
             patch.setattr(ray, "get", lambda references: references)
-            assert driver._resume() == 2
+            known, base, saved = driver._resume()
+            assert (known, base, saved) == (1, whole.dir / "checkpoints" / "member_001", None)
         assert books.attempt == attempt and len(books.population) == 1 and len(loaded) == 3
         assert driver.members.keys() == {1}
 
@@ -265,9 +320,18 @@ def test_a_run_that_goes_on_from_another_can_be_interrupted_before_its_first_own
 @pytest.mark.parametrize(("steps", "rounds"), [("null", 7), ("1000000", 7), ("800", 5), ("799", 4), ("1", 1)])
 def test_rounds_of_a_later_member_end_with_its_steps(root: Path, steps: str, rounds: int) -> None:
     config = smoke(root, "unused", "phase2.rounds=7", f"phase2.max_steps={steps}")
-    driver = pipeline.Driver.__new__(pipeline.Driver)
-    driver.config, driver.spec = config, make_env(config.env.name, 1, **config.env.params).spec
-    assert driver._rounds() == rounds  # (2 + 2) episodes of 40 steps each
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    driver = SimpleNamespace(config=config, spec=spec, members={1: {}})
+    assert LaterMember(driver, 2, seed=0).rounds() == rounds  # (2 + 2) episodes of 40 steps each
+
+
+def test_every_partner_is_met_in_both_seats(root: Path) -> None:
+    config = smoke(root, "unused", "phase2.episodes_xp=2", "phase2.rounds=9", "phase2.max_steps=640")
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    driver = SimpleNamespace(config=config, spec=spec, members={1: {}, 2: {}, 3: {}})
+    later = LaterMember(driver, 4, seed=0)
+    assert set(later.pairs) == {(4, 1), (1, 4), (4, 2), (2, 4), (4, 3), (3, 4)}
+    assert later.episodes_xp == 6 and later.rounds() == 640 // ((2 + 6) * HORIZON)
 
 
 def test_overlapping_work_is_counted_exactly(overlapped: Run) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,24 +12,26 @@ from overcooked_ai_py.mdp.actions import Action
 from overcooked_ai_py.mdp.overcooked_mdp import OvercookedGridworld
 
 from popgen.envs import BatchedEnv, make_env
-from popgen.envs.overcooked.bridge import from_overcooked_ai
+from popgen.envs.overcooked.bridge import from_overcooked_ai, to_overcooked_mdp
 from popgen.envs.overcooked.kernels import TIME
 from popgen.errors import UserError
 from popgen.evaluation.rollout import Transition, play
 from popgen.policies import FeedForwardPolicy, IdlePolicy
 from popgen.policies.overcooked_agent import OvercookedAgent
+from popgen.population import load_population
+from tests.envs.cooks import Cook, Kitchen
 
 STEPS = 200
 
 
-@pytest.fixture(scope="module")
-def env() -> BatchedEnv:
-    return make_env("overcooked/cramped_room", 1, cooking="interact", horizon=STEPS)
+@pytest.fixture(scope="module", params=["interact", "auto"])
+def env(request: pytest.FixtureRequest) -> BatchedEnv:
+    return make_env("overcooked/cramped_room", 1, cooking=request.param, horizon=STEPS)
 
 
-@pytest.fixture(scope="module")
-def mdp() -> OvercookedGridworld:
-    return OvercookedGridworld.from_layout_name("cramped_room")
+@pytest.fixture
+def mdp(env: BatchedEnv) -> OvercookedGridworld:
+    return to_overcooked_mdp(env)
 
 
 class Recorder(FeedForwardPolicy):
@@ -56,6 +59,34 @@ class Hashed(IdlePolicy):
         joint = np.ascontiguousarray(obs[0]).tobytes()
         keys = (bytes([self.salt, self.asked % 256, seat]) for seat in (0, 1))
         return np.array([[hashlib.sha256(key + joint).digest()[0] % 6 for key in keys]], np.uint8)
+
+
+class Recorded(IdlePolicy):
+    """Plays joint actions (T, 2) that were chosen before, from the start again after a reset."""
+
+    def __init__(self, actions: np.ndarray) -> None:
+        super().__init__(["stay"])
+        self.actions, self.asked = actions, 0
+
+    def reset(self, batch: int, seed: int) -> None:
+        self.asked = 0
+
+    def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+        self.asked += 1
+        return self.actions[None, self.asked - 1]
+
+
+def cooked_game(env: BatchedEnv) -> tuple[np.ndarray, np.ndarray, float]:
+    """States (T, S), joint actions (T, 2) and reward of one game of two cooks in our simulator."""
+    kitchen = Kitchen(env)
+    cooks = [Cook(kitchen, seat, np.random.default_rng(seat), 0.05) for seat in (0, 1)]
+    env.reset(seed=0)
+    rows, actions, reward = [], [], 0.0
+    for _ in range(env.spec.horizon):
+        rows.append(env.get_state()[0])
+        actions.append([cook.act(rows[-1]) for cook in cooks])
+        reward += float(env.step(np.array(actions[-1:], np.uint8)).reward[0])
+    return np.stack(rows), np.array(actions, np.uint8), reward
 
 
 def drive(pair: AgentPair, mdp: OvercookedGridworld, env: BatchedEnv) -> tuple[np.ndarray, np.ndarray]:
@@ -114,9 +145,10 @@ def test_another_game_is_refused(env: BatchedEnv, mdp: OvercookedGridworld) -> N
     agent = OvercookedAgent(IdlePolicy(env.spec.action_names), env, 1)
     with pytest.raises(UserError, match="layout is not that of overcooked/cramped_room"):
         agent.set_mdp(OvercookedGridworld.from_layout_name("coordination_ring"))
-    automatic = OvercookedAgent(IdlePolicy(env.spec.action_names), make_env("overcooked/cramped_room", 1), 1)
-    with pytest.raises(UserError, match="cooking mode is interact, the environment's is auto"):
-        automatic.set_mdp(mdp)
+    agent.set_mdp(mdp)
+    other = make_env("overcooked/cramped_room", 1, cooking="auto" if env.cooking == "interact" else "interact")
+    with pytest.raises(UserError, match=f"cooking mode is {other.cooking}, the environment's is {env.cooking}"):
+        agent.set_mdp(to_overcooked_mdp(other))
     with pytest.raises(ValueError, match="seat"):
         OvercookedAgent(IdlePolicy(env.spec.action_names), env, 2)
 
@@ -132,3 +164,35 @@ def test_a_jump_without_reset_is_told(env: BatchedEnv, mdp: OvercookedGridworld)
     agent.reset()
     action, info = agent.action(state)
     assert action == Action.STAY and info["action_probs"].tolist() == [0, 0, 0, 0, 1, 0]
+
+
+def test_a_game_with_many_soups_is_the_same_in_either_game(env: BatchedEnv, mdp: OvercookedGridworld) -> None:
+    rows, actions, reward = cooked_game(env)
+    assert reward >= 60
+    played, answered = drive(AgentPair(*(OvercookedAgent(Recorded(actions), env) for _ in (0, 1))), mdp, env)
+    np.testing.assert_array_equal(answered, actions)
+    np.testing.assert_array_equal(played[:-1], rows)
+
+
+def test_members_of_a_population_play_in_overcooked_ais_own_environment(
+    random_population: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With automatic cooking; version 1.1.0 asks NumPy 2 for a name that it no longer has."""
+    monkeypatch.setattr(np, "Inf", np.inf, raising=False)
+    from overcooked_ai_py.mdp.overcooked_env import OvercookedEnv
+
+    population = load_population(random_population)
+    env = population.make_env()
+    mdp = to_overcooked_mdp(env)
+    assert population.env_info.cooking == "auto" and mdp.old_dynamics
+    game = OvercookedEnv.from_mdp(mdp, horizon=env.spec.horizon, info_level=0)
+    pair = AgentPair(*(OvercookedAgent(population[member], env, seed=member) for member in (1, 2)))
+    pair.set_mdp(mdp)
+    trajectory, steps, *_ = game.run_agents(pair)
+    assert steps == env.spec.horizon and len({joint for _, joint, *_ in trajectory}) > 5
+
+    cooks = make_env("overcooked/cramped_room", 1, cooking="auto", horizon=STEPS)
+    _, actions, reward = cooked_game(cooks)
+    game = OvercookedEnv.from_mdp(to_overcooked_mdp(cooks), horizon=STEPS, info_level=0)
+    _, steps, score, _ = game.run_agents(AgentPair(*(OvercookedAgent(Recorded(actions), cooks) for _ in (0, 1))))
+    assert (steps, score) == (STEPS, reward) and reward >= 60

@@ -148,7 +148,7 @@ def test_output_biases_start_at_the_means_of_the_data() -> None:
             model.continue_head[-1],
         ):
             layer.weight.zero_()
-    model.set_output_biases(obs_mean, event_mean)
+    model.set_outputs(obs_mean[None, None], event_mean[None, None])
     wanted = obs_mean.clamp(1e-3, 1 - 1e-3)
     torch.testing.assert_close(torch.sigmoid(model.decode(latent)[7]), wanted, atol=1e-6, rtol=1e-4)
     wanted = event_mean.clamp(1e-3, 1 - 1e-3)
@@ -167,12 +167,12 @@ def test_exact_needs_every_number_of_both_players() -> None:
 
 def test_exact_of_counts_is_after_rounding() -> None:
     model = make_model(MODEL.model_copy(update={"view": "lossless", "cnn_channels": 2, "cnn_kernels": (3,)}))
-    scale = SPEC.views["lossless"].scale
-    counts = torch.randint(0, 21, (2, 2, *SPEC.views["lossless"].shape), generator=generator()).float()
-    obs = counts / scale
-    decoded = (counts + 0.4) / scale
+    largest = model.filter.maxima
+    shape = (2, 2, *SPEC.views["lossless"].shape)
+    counts = torch.floor(torch.rand(shape, generator=generator()) * largest)
+    obs, decoded = counts / largest, torch.logit((counts + 0.4) / largest, eps=1e-6)
     assert model.exact(decoded, obs).tolist() == [True, True]
-    decoded[0, 0, 1, 1, 3] += 0.2 / scale
+    decoded[0, 0, 1, 1, 3] = torch.logit((counts[0, 0, 1, 1, 3] + 0.6) / largest[..., 3].max(), eps=1e-6)
     assert model.exact(decoded, obs).tolist() == [False, True]
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import torch
 
 from popgen.algos.xpm_wm.model_learner import Batch, ModelLearner
+from popgen.config import OPEN_LOOP
 from popgen.data.replay import Windows
 from popgen.losses.world_model import event_counts
 from popgen.nets.latents import Latent
 from popgen.world_model.model import WorldModel
-
-OPEN_LOOP = 4
-"""Steps without observations at which open-loop figures are taken."""
 
 
 @torch.no_grad()

@@ -72,6 +72,9 @@ class ModelLearner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
 
+    def _rate(self) -> float:
+        return float(self.optimiser.param_groups[0]["lr"])
+
     def add_predecessor(self, member: int, filter_weights: w.Weights) -> None:
         """Keep member's archived filter q_{theta^k} for the KL term of equation WM+."""
         archived = LatentFilter(self.config, self.spec)
@@ -81,7 +84,7 @@ class ModelLearner:
     def set_biases(self, windows: Windows) -> None:
         """Output biases at the data's means; call once before the first update."""
         batch = Batch.of(windows, self.model)
-        self.model.set_output_biases(batch.obs.mean((0, 1)), batch.events.flatten(2).mean((0, 1)))
+        self.model.set_outputs(batch.obs, batch.events.flatten(2))
 
     def losses(self, batch: Batch) -> tuple[dict[str, Tensor], Observed, dict[str, Tensor]]:
         """Unweighted loss terms (T, B)-averaged, the observed window, and tensors worth logging."""
@@ -135,14 +138,22 @@ class ModelLearner:
         }
 
     def update(self, windows: Windows) -> tuple[dict[str, float], Observed]:
-        """One gradient step on a batch of windows; metrics and the posteriors (detached)."""
+        """One gradient step on a batch of windows; metrics and the posteriors (detached).
+
+        Raises:
+            FloatingPointError: the loss or its gradient is not finite; the weights are those of before.
+        """
         batch = Batch.of(windows, self.model)
         terms, seen, extras = self.losses(batch)
         weights = self.loss_weights()
         loss = sum(weights[name] * term for name, term in terms.items())
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
+        if not torch.isfinite(loss.detach() + norm):
+            bad = [name for name, term in terms.items() if not torch.isfinite(term)] or ["gradient"]
+            problem = f"{' and '.join(bad)} not finite in update {self.updates + 1} of the world model"
+            raise FloatingPointError(f"{problem}, at a learning rate of {self._rate():g}")
         self.optimiser.step()
         self.updates += 1
         metrics = {f"loss_{name}": float(term.detach()) for name, term in terms.items()}

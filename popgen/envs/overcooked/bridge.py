@@ -1,7 +1,12 @@
-"""Between state rows and overcooked_ai's own state objects, exact both ways."""
+"""Between our kitchens and overcooked_ai's own objects: states, exact both ways, and the game itself.
+
+Needs overcooked_ai; no other module of `popgen.envs` imports this one.
+"""
 
 from __future__ import annotations
 
+from contextlib import redirect_stderr
+from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,10 +16,59 @@ from popgen.envs.overcooked.layout import DIRECTIONS
 from popgen.envs.overcooked.rules import NOTHING, SOUP_CODE, SOUPS
 from popgen.envs.overcooked.start import ITEM_CODE
 
+with redirect_stderr(StringIO()):  # gym, which overcooked_ai imports, prints that it is no longer maintained
+    from overcooked_ai_py.mdp.overcooked_mdp import (
+        ObjectState,
+        OvercookedGridworld,
+        OvercookedState,
+        PlayerState,
+        Recipe,
+        SoupState,
+    )
+
 if TYPE_CHECKING:
     from popgen.envs.overcooked.env import OvercookedEnv
 
 ITEM_NAME = {code: name for name, code in ITEM_CODE.items()}
+
+
+class AutomaticGridworld(OvercookedGridworld):
+    """Automatic cooking, which overcooked_ai 1.1.0 lacks and later versions call `old_dynamics`.
+
+    A full pot begins to cook by itself; an empty-handed interact with a pot that does not cook does nothing.
+    """
+
+    old_dynamics = True
+
+    def soup_to_be_cooked_at_location(self, state: Any, pos: tuple[int, int]) -> bool:
+        """No interact starts a pot."""
+        return False
+
+    def step_environment_effects(self, state: Any) -> None:
+        """Time passes, in the pots that have just been filled too."""
+        for thing in state.objects.values():
+            if thing.name == "soup" and thing.is_idle and len(thing.ingredients) == Recipe.MAX_NUM_INGREDIENTS:
+                thing.begin_cooking()
+        super().step_environment_effects(state)
+
+
+def to_overcooked_mdp(env: OvercookedEnv) -> OvercookedGridworld:
+    """overcooked_ai's game with an environment's layout, orders, recipes and cooking mode.
+
+    For a population: `to_overcooked_mdp(population.make_env())`. overcooked_ai keeps its recipes in one place for the
+    whole process: play the game that was made last.
+    """
+    layout = env.layout
+    if layout.from_file:
+        mdp = OvercookedGridworld.from_layout_name(layout.name)
+    else:
+        config = {"layout_name": layout.name, **layout.config}
+        if config.get("start_state"):
+            config["start_state"] = OvercookedState.from_dict(config["start_state"])
+        mdp = OvercookedGridworld.from_grid(list(layout.rows), config)
+    if env.cooking == "auto":
+        mdp.__class__ = AutomaticGridworld
+    return mdp
 
 
 def _item_code(thing: Any, cooked: bool = True) -> int:
@@ -28,7 +82,7 @@ def _item_code(thing: Any, cooked: bool = True) -> int:
     return SOUP_CODE[thing.ingredients.count("onion"), thing.ingredients.count("tomato")]
 
 
-def from_overcooked_ai(env: OvercookedEnv, state: Any, time: int | None = None) -> np.ndarray:
+def from_overcooked_ai(env: OvercookedEnv, state: OvercookedState, time: int | None = None) -> np.ndarray:
     """State row (S,) uint8 of an `OvercookedState`.
 
     Args:
@@ -59,12 +113,11 @@ def from_overcooked_ai(env: OvercookedEnv, state: Any, time: int | None = None) 
     return row
 
 
-def to_overcooked_ai(env: OvercookedEnv, row: np.ndarray) -> Any:
+def to_overcooked_ai(env: OvercookedEnv, row: np.ndarray) -> OvercookedState:
     """The `OvercookedState` of a state row (S,).
 
     The ingredients of mixed soups come onions first, since rows do not hold the order in which they went in.
     """
-    from overcooked_ai_py.mdp.overcooked_mdp import ObjectState, OvercookedState, PlayerState, SoupState
 
     def thing(code: int, cell: tuple[int, int], cooking: int = 1) -> Any:
         if code < k.FIRST_SOUP:

@@ -17,6 +17,7 @@ from popgen.errors import UserError
 NOTHING = 0
 MAX_INGREDIENTS = 3
 MAX_COOK_TIME = 250  # a pot's byte also tells idle and ready
+MAX_VALUE = 1_000_000  # of a recipe: sums of rewards stay exact
 
 SOUPS: tuple[tuple[int, int], ...] = tuple(
     (total - tomatoes, tomatoes) for total in range(1, MAX_INGREDIENTS + 1) for tomatoes in range(total + 1)
@@ -124,8 +125,9 @@ def _check_types(config: Mapping[str, Any], field: str) -> None:
     figures = [(key, config[key]) for key in (*_RECIPE_KEYS[2:], "order_bonus") if key in config]
     figures += [(key, value) for key in ("recipe_values", "recipe_times") for value in config.get(key) or ()]
     for key, value in figures:
-        if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
-            raise UserError(field, f"{key} must be a number, got {value!r}")
+        largest = float("inf") if key == "order_bonus" else MAX_VALUE  # a layout of overcooked_ai's has that
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:
+            raise UserError(field, f"{key} must be a number of at most {largest:,}, got {value!r}")
 
 
 def _check_clashes(config: Mapping[str, Any], field: str) -> None:

@@ -1,0 +1,227 @@
+"""Member 1: the world model and a self-play agent together (phase 1)."""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import ray
+
+from actors.sampler import Collected, PolicyParts
+from pipelines.rounds import run_rounds
+from pipelines.snapshot import Published, Snapshot
+from popgen.algos.xpm_wm.starts import Starts
+from popgen.data.sampler import Team
+from popgen.policies.simple import RandomPolicy
+from popgen.types import RANDOM_MEMBER, Kind
+
+if TYPE_CHECKING:
+    from pipelines.population import Driver
+
+MEMBER = 1
+PREFILL_CHUNK = 400
+PIECE = 100
+"""World-model updates between two signs of progress."""
+
+
+class FirstMember:
+    """Random play, world-model updates alone, then rounds of sampling, model learning and agent learning.
+
+    What the three kinds of work published last is kept here, as references.
+    """
+
+    def __init__(self, driver: Driver, seed: int) -> None:
+        self.driver, self.config, self.phase, self.seed = driver, driver.config, driver.config.phase1, seed
+        window = max(16, self.phase.envs // 2)
+        self.recent: deque[float] = deque(maxlen=window)
+        self.shaped: deque[float] = deque(maxlen=window)
+        self.figures: dict[str, float] = {}
+        self.rounds = self.since_best = 0
+        self.top: Snapshot | None = None
+        self.restarted = False
+
+    def train(self, saved: dict[str, Any] | None) -> Snapshot:
+        """Until the budget, the target or the patience ends; `saved` is a checkpoint to go on from."""
+        crew = self.driver.crew
+        ray.get(crew.agent.begin_member.remote(MEMBER, self.seed, {}))
+        if saved is None:
+            self._prefill()
+            self._pretrain()
+        else:
+            self.driver.restore_learners(saved)
+            self._restore(saved["first_member"])
+        self.driver.reporter.phase("member 1: self-play", self.phase.max_steps)
+        self._sit_down()
+        if saved is None:
+            self._save()
+        else:
+            crew.players.load_state(saved["samplers"])
+        checkpoints = self.driver.checkpoints
+        run_rounds(
+            self._work(),
+            stop=self._stop,
+            after=self._after,
+            schedule=self.config.run.schedule,
+            due=checkpoints.due,
+            save=self._save,
+        )
+        return self._best()
+
+    # ---- before the rounds -----------------------------------------------------------------------------------------
+
+    def _prefill(self) -> None:
+        """K random episodes (algorithm 1)."""
+        phase, driver = self.phase, self.driver
+        driver.reporter.phase("member 1: random play", phase.prefill_steps)
+        names, interact, probabilities = driver.spec.action_names, phase.prefill_interact, None
+        if interact and "interact" in names:
+            rest = (1.0 - interact) / (len(names) - 1)
+            probabilities = [interact if name == "interact" else rest for name in names]
+        random = RandomPolicy(driver.spec.num_actions, probabilities)
+        parts = {RANDOM_MEMBER: PolicyParts(random.kind, random.config(), {})}
+        team = Team(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), phase.envs)
+        driver.crew.players.open([team], parts, self.seed)
+        while driver.steps < phase.prefill_steps:
+            missing = (phase.prefill_steps - driver.steps) // phase.envs
+            driver.play(MEMBER, max(1, min(PREFILL_CHUNK, missing)))
+            driver.reporter.update(driver.steps, steps=driver.steps)
+
+    def _pretrain(self) -> None:
+        """World-model updates alone, in pieces for the progress bar; then the agent's first ones."""
+        driver, total = self.driver, self.phase.pretrain_updates
+        driver.reporter.phase("member 1: world model on random play", total)
+        for done in range(0, total, PIECE):
+            count = min(PIECE, total - done)
+            self.model, self.starts, info = self._learn_model(count)
+            metrics = ray.get(info)
+            driver.log(MEMBER, **{f"model/{k}": v for k, v in metrics.items()})
+            driver.reporter.update(done + count, model_loss=round(metrics["loss_observation"], 2))
+        self.published, info = self._publish(self._learn_agent())
+        ray.get(info)
+
+    def _sit_down(self) -> None:
+        parts = {MEMBER: self.driver.parts(ray.get(self.published.acting))}
+        self.driver.crew.players.open([Team(Kind.SP, (MEMBER, MEMBER), self.phase.envs)], parts, self.seed, True)
+
+    # ---- the rounds ------------------------------------------------------------------------------------------------
+
+    def _learn_model(self, updates: int) -> tuple[Any, ...]:
+        return self.driver.crew.model.train.options(num_returns=3).remote(updates, self.config.agent.starts_sp)
+
+    def _learn_agent(self) -> tuple[Any, ...]:
+        """References to acting weights, critics, model and metrics."""
+        train = self.driver.crew.agent.train.options(num_returns=3)
+        acting, critics, info = train.remote(self.phase.agent_updates, self.model, self.starts, 0.0, {})
+        return acting, critics, self.model, info
+
+    def _publish(self, result: tuple[Any, ...]) -> tuple[Published, Any]:
+        acting, critics, model, info = result
+        return Published(acting, model, critics), info
+
+    def _work(self) -> dict[str, tuple[Any, Any]]:
+        """The kinds of work, each sampler one of them; their order is that in which a round takes the results."""
+        players = self.driver.crew.players
+        samplers = {f"sampler{i}": (partial(self._sample, i), self._sampled) for i in players.active}
+        return samplers | {
+            "model": (lambda: self._learn_model(self.phase.model_updates), self._model_learned),
+            "agent": (self._learn_agent, self._agent_learned),
+        }
+
+    def _sample(self, index: int) -> Any:
+        self.played = self.published
+        return self.driver.crew.players.start(index, self.phase.steps_per_iteration, MEMBER, self.published.acting)
+
+    def _sampled(self, result: tuple[Any, Collected]) -> None:
+        segments, collected = result
+        self.driver.absorb(MEMBER, segments, collected)
+        self.recent.extend(e.score for e in collected.episodes)
+        self.shaped.extend(e.shaped for e in collected.episodes)
+
+    def _model_learned(self, result: tuple[Any, Any, dict[str, float]]) -> None:
+        self.model, self.starts, metrics = result
+        self.figures |= {f"model/{name}": value for name, value in metrics.items()}
+
+    def _agent_learned(self, result: tuple[Any, ...]) -> None:
+        self.published, metrics = self._publish(result)
+        self.figures |= {f"agent/{name}": value for name, value in metrics.items()}
+
+    def _after(self) -> None:
+        """Book-keeping at the end of a round."""
+        driver = self.driver
+        self.rounds += 1
+        if self.recent:
+            self.figures |= {
+                "real_sp": float(np.mean(self.recent)),
+                "real_reward_sp": float(np.mean(self.shaped)) / driver.spec.horizon,
+            }
+        if self.rounds % self.phase.check_every == 0:
+            self.figures |= {f"report/{k}": v for k, v in ray.get(driver.crew.model.report.remote()).items()}
+        driver.log(MEMBER, **self.figures)
+        self._keep_best()
+        self._restart_if_due()
+        score = round(self.figures.get("real_sp", 0.0), 2)
+        driver.reporter.update(driver.steps, steps=driver.steps, **{driver.spec.score_name: score})
+
+    @property
+    def _full(self) -> bool:
+        """Enough episodes to judge by."""
+        return len(self.recent) == self.recent.maxlen
+
+    def _keep_best(self) -> None:
+        """The policy that played, not the one learned meanwhile; rounds count once there is something to judge by."""
+        if not self._full:
+            return
+        score = float(np.mean(self.recent))
+        if self.top is None or score > self.top.sp:
+            self.top = Snapshot(self.played, score, 0.0)
+            self.since_best = 0
+        else:
+            self.since_best += 1
+
+    def _restart_if_due(self) -> None:
+        """Fresh actor and critics on the world model learned so far, once (an actor can get stuck, a model less)."""
+        phase, driver = self.phase, self.driver
+        if self.restarted or not phase.restart_updates or driver.steps < phase.restart_after:
+            return
+        self.restarted = True
+        driver.reporter.note(f"member 1: actor and critics start again on the world model of {driver.steps:,} steps")
+        ray.get(driver.crew.agent.restart.remote(self.seed + 500))
+        for _ in range(0, phase.restart_updates, phase.agent_updates):
+            self.published, info = self._publish(self._learn_agent())
+            ray.get(info)
+
+    def _stop(self) -> bool:
+        """Budget spent, target reached over a full window of episodes, or no better for `patience` rounds."""
+        reached = self._full and float(np.mean(self.recent)) >= self.phase.target_score
+        return self.driver.steps >= self.phase.max_steps or reached or self.since_best >= self.phase.patience
+
+    def _best(self) -> Snapshot:
+        """The weights with the best window, unless the last ones are about as good (they learned longer)."""
+        last = Snapshot(self.published, float(np.mean(self.recent)) if self.recent else 0.0, 0.0)
+        return last if self.top is None or last.sp >= 0.95 * self.top.sp else self.top
+
+    # ---- checkpoints -----------------------------------------------------------------------------------------------
+
+    def _save(self) -> None:
+        model, starts = ray.get([self.model, self.starts])
+        state = {
+            "model": model,
+            "starts": vars(starts),
+            "published": self.published.weights(),
+            "top": None if self.top is None else self.top.state(),
+            "recent": list(self.recent),
+            "shaped": list(self.shaped),
+            "figures": dict(self.figures),
+            "counters": [self.rounds, self.since_best, self.restarted],
+        }
+        self.driver.save(MEMBER, {"first_member": state, "samplers": self.driver.crew.players.state()})
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.model, self.starts = ray.put(state["model"]), ray.put(Starts(**state["starts"]))
+        self.published, self.top = Published.of(state["published"]), Snapshot.of(state["top"])
+        self.recent.extend(state["recent"])
+        self.shaped.extend(state["shaped"])
+        self.figures = dict(state["figures"])
+        self.rounds, self.since_best, self.restarted = state["counters"]

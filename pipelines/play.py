@@ -1,0 +1,60 @@
+"""Real episodes, spread over all samplers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import ray
+
+from actors.sampler import Collected, PolicyParts
+from popgen.data.sampler import Team, split_teams
+from popgen.errors import UserError
+
+
+class Players:
+    """The sampler actors as one: teams are split over them as evenly as possible, results come in their order."""
+
+    def __init__(self, samplers: list[Any]) -> None:
+        self.samplers = samplers
+        self.active: list[int] = []
+
+    def open(self, teams: list[Team], parts: dict[int, PolicyParts], seed: int, stagger: bool = False) -> None:
+        """Start fresh episodes; every sampler gets the policies of its own teams and a seed of its own."""
+        shares = split_teams(teams, len(self.samplers))
+        self.active = [index for index, share in enumerate(shares) if share]
+        opened = []
+        for index in self.active:
+            present = sorted({member for team in shares[index] for member in team.members})
+            own = {member: parts[member] for member in present}
+            opened.append(self.samplers[index].open.remote(shares[index], own, seed_of(seed, index), stagger))
+        ray.get(opened)
+
+    def start(self, index: int, steps: int, member: int | None = None, weights: Any = None) -> tuple[Any, Any]:
+        """Let one sampler play, with new weights (a reference) for one member: references to segments and counts."""
+        return self.samplers[index].collect.options(num_returns=2).remote(steps, member, weights)
+
+    def collect(self, steps: int) -> list[tuple[Any, Collected]]:
+        """Let all play at the same time: segments (a reference) and counts of each."""
+        pending = [self.start(index, steps) for index in self.active]
+        return [(segments, ray.get(counts)) for segments, counts in pending]
+
+    def state(self) -> list[dict[str, Any]]:
+        """All samplers' running episodes."""
+        return ray.get([sampler.state.remote() for sampler in self.samplers])
+
+    def load_state(self, states: list[dict[str, Any]]) -> None:
+        """Go on from `state()`, after `open` with the same teams.
+
+        Raises:
+            UserError: another number of samplers.
+        """
+        if len(states) != len(self.samplers):
+            problem = f"{len(self.samplers)}, but the checkpoint is of {len(states)}"
+            raise UserError("cluster.samplers", problem, "go on with the same number")
+        ray.get([sampler.load_state.remote(state) for sampler, state in zip(self.samplers, states, strict=True)])
+
+
+def seed_of(seed: int, sampler: int) -> int:
+    """The seed itself for the first sampler, an independent one for each other."""
+    return seed if sampler == 0 else int(np.random.SeedSequence((seed, sampler)).generate_state(1)[0] >> 1)
