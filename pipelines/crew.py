@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +17,7 @@ from actors.replay import ReplayActor
 from actors.sampler import SamplerActor
 from pipelines.play import Players
 from popgen.config import ClusterConfig, RunConfig
+from popgen.errors import UserError
 
 
 def start_ray(cluster: ClusterConfig) -> bool:
@@ -25,15 +28,36 @@ def start_ray(cluster: ClusterConfig) -> bool:
     # Quiet: Ray warns once about the accelerator variable it will stop overriding.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     local = cluster.address is None
-    ray.init(
-        # Without an address Ray would look for a running cluster before it starts a local one.
-        address="local" if local else cluster.address,
-        num_cpus=cluster.num_cpus if local else None,
-        include_dashboard=False if local else None,
-        log_to_driver=False,
-        logging_level="ERROR",
-    )
+    try:
+        ray.init(
+            # Without an address Ray would look for a running cluster before it starts a local one.
+            address="local" if local else cluster.address,
+            # On fewer cores than the actors ask for they take turns.
+            num_cpus=cluster.num_cpus or max(os.cpu_count() or 1, math.ceil(cluster.cpus)) if local else None,
+            include_dashboard=False if local else None,
+            log_to_driver=False,
+            logging_level="ERROR",
+        )
+    except ConnectionError as error:
+        raise UserError("cluster.address", f"no Ray answers ({error})", "start it, or use cluster=laptop") from None
+    if not local:
+        check_resources(cluster, ray.cluster_resources())
     return True
+
+
+def check_resources(cluster: ClusterConfig, have: Mapping[str, float]) -> None:
+    """The actors must find room, or they wait for ever.
+
+    Raises:
+        UserError: the whole cluster has less than all of them ask for.
+    """
+    actors = cluster.samplers + 4
+    needed = {"CPU": cluster.cpus, "GPU": cluster.model_gpus + cluster.agent_gpus}
+    needed |= {name: actors * amount for name, amount in cluster.resources.items()}
+    for name, amount in needed.items():
+        if amount > have.get(name, 0.0):
+            problem = f"the actors ask for {amount:g} {name}, the cluster has {have.get(name, 0.0):g}"
+            raise UserError("cluster", problem, "ask for less, or wait until its nodes are up")
 
 
 @dataclass

@@ -214,7 +214,7 @@ class Driver:
             return 0, None, saved
         folder = member_folder(root, known)
         state = load_state(folder)
-        self._forget(saved["ledger"] if saved else state.get("ledger") if known == present else 0)
+        self._forget(saved["ledger"] if saved else state.get("ledger") if root == self.books.dir else 0)
         if saved is None:
             ray.get([getattr(self.crew, name).load_state.remote(state[name]) for name in (*REPLAYS, "model")])
         self._take_over(root, known, present)

@@ -246,6 +246,11 @@ class ClusterConfig(Schema):
     threads: Annotated[_Int, Field(ge=1, le=1024)] = 1
     resources: dict[str, Weight] = {}
 
+    @property
+    def cpus(self) -> float:
+        """What all actors together ask for."""
+        return self.samplers * self.sampler_cpus + 2 * self.replay_cpus + self.model_cpus + self.agent_cpus
+
 
 class TrackingConfig(Schema):
     """MLflow; without a URI a sqlite store in the run's folder."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from popgen.config import OPEN_LOOP, SHAPES, RunConfig
+from popgen.config import OPEN_LOOP, SHAPES, ClusterConfig, RunConfig
 from popgen.envs.base import EnvSpec
 from popgen.envs.registry import make_env
 from popgen.errors import UserError
@@ -36,6 +36,7 @@ def preflight(config: RunConfig) -> None:
     _check_rewards(config, spec)
     check_run_id(config.run.id)
     _check_lengths(config, spec)
+    check_cluster(config.cluster)
     if config.tracking.enabled:
         check_uri(config.tracking.uri)
     if config.population.init_from is not None:
@@ -60,8 +61,8 @@ def buffer_bytes(config: RunConfig, spec: EnvSpec) -> int:
 
 
 def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Bytes of the run's folder at most: a checkpoint with both buffers for each member, and one being written."""
-    return (config.population.size + 1) * buffer_bytes(config, spec) + MARGIN
+    """Bytes of the run's folder at most: both buffers for each member, in two copies and a log for the running one."""
+    return (config.population.size + 4) * buffer_bytes(config, spec) + MARGIN
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
@@ -72,6 +73,22 @@ def check_memory(config: RunConfig, spec: EnvSpec) -> None:
     if needed > have:
         problem = f"{config.replay.capacity:,} steps need about {_gib(needed)}, this machine has {_gib(have)}"
         raise UserError("replay.capacity", problem, "lower it")
+
+
+def check_cluster(cluster: ClusterConfig) -> None:
+    """A local Ray must have what the actors ask for, or they wait for ever; a running cluster is asked itself later."""
+    if cluster.address is not None:
+        return
+    needed, have = cluster.cpus, cluster.num_cpus
+    if have is not None and have < needed:
+        raise UserError("cluster.num_cpus", f"{have}, but the actors ask for {needed:g}", "raise it or ask for less")
+    gpus, found = cluster.model_gpus + cluster.agent_gpus, len(list(Path("/dev").glob("nvidia[0-9]*")))
+    if gpus > found:
+        problem = f"the learners ask for {gpus:g} GPUs, this machine has {found}"
+        raise UserError("cluster.model_gpus", problem, "set cluster.model_gpus and cluster.agent_gpus to 0")
+    if asked := [name for name, amount in cluster.resources.items() if amount]:
+        problem = "is a resource that a local Ray does not have"
+        raise UserError(f"cluster.resources.{asked[0]}", problem, "leave it out or give cluster.address")
 
 
 def check_root(root: Path, needed: int, field: str = "run.root") -> None:
@@ -127,6 +144,13 @@ def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
     if window > spec.horizon:
         problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
         raise UserError("world_model.length", f"{problem} ({spec.horizon})", "shorten them")
+    first = config.phase1
+    if first.steps_per_iteration < window:
+        problem = f"{first.steps_per_iteration} is shorter than the windows of {window} steps that are drawn of them"
+        raise UserError("phase1.steps_per_iteration", problem, "raise it or lower world_model.length")
+    if first.prefill_steps < window * first.envs:
+        problem = f"{first.prefill_steps:,} in {first.envs} environments are less than a window of {window} steps each"
+        raise UserError("phase1.prefill_steps", problem, "raise it or lower phase1.envs")
     added = max(phase.episodes_sp, phase.episodes_xp) * (spec.horizon + 1)
     if config.replay.capacity < added:
         problem = f"cannot hold the {added:,} steps that phase2 adds at once"

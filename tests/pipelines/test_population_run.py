@@ -35,6 +35,7 @@ from popgen.progress import NullReporter
 from popgen.types import Kind
 
 HORIZON = 40
+THREE = ("cluster.samplers=3", "cluster.sampler_cpus=0.05")
 
 
 @dataclass
@@ -146,7 +147,7 @@ def continued(whole: Run, root: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def overlapped(cluster: None, root: Path) -> Run:
-    return launch(root, "overlapped", "run.schedule=async", "population.size=1", "cluster.samplers=3", local=False)
+    return launch(root, "overlapped", "run.schedule=async", "population.size=1", *THREE, local=False)
 
 
 def check_ledger(run: Run) -> None:
@@ -166,7 +167,7 @@ def check_ledger(run: Run) -> None:
     }
     assert counted == dict(said) and min(counted.values()) > 0
     held: Counter[tuple[int, str]] = Counter()
-    last = sorted((run.dir / "checkpoints").iterdir())[-1]
+    last = sorted((run.dir / "checkpoints").glob("member_*"))[-1]
     for name in ("replay_sp", "replay_xp"):
         arrays = load_state(last)[name]["replay"]["arrays"]
         assert not arrays["terminal"].any()  # every row is a step, none an arrival
