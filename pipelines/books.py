@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections import Counter
 from datetime import UTC, datetime
@@ -20,7 +21,7 @@ from popgen.errors import UserError
 from popgen.nets.weights import Weights
 from popgen.policies.base import Policy
 from popgen.policies.world_model_policy import WorldModelPolicy
-from popgen.population import PopulationWriter
+from popgen.population import PopulationWriter, load_population
 from popgen.population.manifest import MemberInfo
 from popgen.types import Kind, LedgerEntry
 
@@ -38,6 +39,7 @@ class Books:
         self.began = time.time()
         self._check_same_config()
         self.attempt = self._next_attempt()
+        self._mend_metrics()
         self.ledger = Ledger(self.dir / "ledger.jsonl")
         self.population = PopulationWriter(
             self.dir / "population",
@@ -53,10 +55,13 @@ class Books:
     def _check_same_config(self) -> None:
         path = self.dir / "config.json"
         if path.exists():
-            known = RunConfig.parse(json.loads(path.read_text()))
+            try:
+                known = RunConfig.parse(json.loads(path.read_text()))
+            except ValueError as error:  # damaged, or of a version with other fields
+                raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
             if known.digest() != self.config.digest():
                 raise UserError("run.id", f"{self.run_id} exists with another config", "choose another id")
-        path.write_text(json.dumps(self.config.model_dump(mode="json"), indent=1))
+        _replace(path, json.dumps(self.config.model_dump(mode="json"), indent=1))
 
     def _next_attempt(self) -> int:
         path = self.dir / "attempts.txt"
@@ -68,6 +73,13 @@ class Books:
     def _resumed(self) -> dict[str, Any] | None:
         path = self.dir / "tracking.json"
         return json.loads(path.read_text()) if path.exists() else None
+
+    def _mend_metrics(self) -> None:
+        """A process that died while it wrote a point leaves half a line."""
+        path = self.dir / "metrics.jsonl"
+        data = path.read_bytes() if path.exists() else b""
+        if data and not data.endswith(b"\n"):
+            os.truncate(path, data.rfind(b"\n") + 1)
 
     def record(self, member: int, collected: Collected) -> None:
         """Enter a round of sampling: one ledger entry per segment."""
@@ -108,13 +120,16 @@ class Books:
         policy.load(policy_weights)
         steps = self.training_steps(member)
         self.population.add_member(policy, seed=seed, steps=steps, training=training, extra=extra)
-        total = sum(sum(self.training_steps(k).values()) for k in range(1, member + 1))
-        self.tracker.log_scaling(member, total)
+        self.tracker.log_scaling(member, sum(self.member_steps()))
         self.save_tracking()
+
+    def member_steps(self) -> list[int]:
+        """Environment steps that each member's training took, those of another run included."""
+        return [info.total_steps for info in load_population(self.population.path).members]
 
     def save_tracking(self) -> None:
         """Keep the MLflow run ids: a resumed run goes on in the same MLflow runs."""
-        (self.dir / "tracking.json").write_text(json.dumps(self.tracker.flush()))
+        _replace(self.dir / "tracking.json", json.dumps(self.tracker.flush()))
 
     def adopt(self, policy: Policy, info: MemberInfo, training: Weights | None) -> None:
         """Copy a member of another run; its steps stay in that run's ledger and in the member's record."""
@@ -124,6 +139,13 @@ class Books:
         """Everything to disk; status is MLflow's FINISHED, FAILED or KILLED."""
         self.ledger.flush()
         self.tracker.finish(status)
+
+
+def _replace(path: Path, text: str) -> None:
+    """The old contents or the new, whatever interrupts it."""
+    fresh = path.with_name(path.name + ".writing")
+    fresh.write_text(text)
+    fresh.replace(path)
 
 
 def _rounded(value: float) -> float | None:

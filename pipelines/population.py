@@ -249,9 +249,8 @@ class Driver:
         size = len(books.population)
         episodes = result.episodes * len(result.pairings)
         books.record_steps(size, Kind.EVALUATION, f"evaluation.{books.attempt}", 0, result.steps, episodes)
-        steps = [sum(books.training_steps(member).values()) for member in range(1, size + 1)]
         files |= write_run_figures(
-            books.dir, books.dir / "report", steps, unit=self.spec.score_name, title=self.spec.name
+            books.dir, books.dir / "report", books.member_steps(), unit=self.spec.score_name, title=self.spec.name
         )
         for file in files.values():
             books.tracker.log_artifact(file, "report")

@@ -10,7 +10,10 @@ from popgen.evaluation.plots import learning_curves, steps_by_members
 
 
 def training_curves(metrics: Path) -> dict[str, tuple[list[float], list[float]]]:
-    """Real self-play and strongest cross-play over each member's own steps: name -> (steps, scores)."""
+    """Real self-play and strongest cross-play over each member's own steps: name -> (steps, scores).
+
+    Steps only grow: of points that a resumed run gave again, the last ones count.
+    """
     curves: dict[str, tuple[list[float], list[float]]] = {}
     names = {"real_sp": "SP", "real_xp_max": "strongest XP"}
     for line in metrics.read_text().splitlines():
@@ -18,6 +21,9 @@ def training_curves(metrics: Path) -> dict[str, tuple[list[float], list[float]]]
         for field, label in names.items():
             if row.get(field) is not None:
                 steps, scores = curves.setdefault(f"member {row['member']}, {label}", ([], []))
+                while steps and steps[-1] >= row["step"]:
+                    steps.pop()
+                    scores.pop()
                 steps.append(row["step"])
                 scores.append(row[field])
     return curves

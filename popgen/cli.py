@@ -19,15 +19,17 @@ from typing import Any, NoReturn
 
 import popgen
 from popgen.errors import UserError
+from popgen.jsonable import jsonable
 
 OK, ERROR, INTERRUPTED = 0, 2, 130
 ALIASES = {"seed": "run.seed"}
-OPEN_SECTIONS = ("env.params.", "cluster.resources.")  # dictionaries that take any key
+OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take any key
+_ROOM = "make room or choose another folder; finished parts are kept"
 _DISK = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the disk quota is used up",
-    errno.EROFS: "the file system is read-only",
-    errno.EACCES: "permission denied",
+    errno.ENOSPC: ("the disk is full", _ROOM),
+    errno.EDQUOT: ("the disk quota is used up", _ROOM),
+    errno.EROFS: ("the file system is read-only", "choose another folder"),
+    errno.EACCES: ("permission denied", "choose a folder you can read and write"),
 }
 
 
@@ -46,18 +48,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
+    except MemoryError as error:
+        return _fail(str(UserError("memory", f"is not enough ({error})", "ask for less at a time")))
     except OSError as error:
-        if error.errno not in _DISK:
+        if error.errno not in _DISK and error.filename is None:
             raise
-        where = str(error.filename or "disk")
-        return _fail(
-            str(UserError(where, _DISK[error.errno], "make room or choose another folder; finished parts are kept"))
-        )
+        where = _short(str(error.filename or "disk"))
+        problem, fix = _DISK.get(error.errno or 0, (error.strerror or str(error), "check the path"))
+        return _fail(str(UserError(where, problem, fix)))
 
 
 def _fail(message: str) -> int:
-    print(f"popgen: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"popgen: error: {_short(' '.join(message.split()), 2000)}", file=sys.stderr)
     return ERROR
+
+
+def _short(text: str, length: int = 100) -> str:
+    return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
 # --- commands
@@ -106,19 +113,7 @@ def _print_config(values: dict[str, Any], as_json: bool) -> int:
 
 def _print_json(value: Mapping[str, Any]) -> None:
     """Exactly one JSON object; numbers that are not finite become null."""
-    print(json.dumps(_plain(value), allow_nan=False))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):  # numpy
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if isinstance(value, str | int | float | bool | None) else str(value)
+    print(json.dumps(jsonable(value), allow_nan=False))
 
 
 def _print_run(result: Mapping[str, Any]) -> None:
@@ -190,29 +185,13 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace) -> int:
     from popgen.population import load_population
+    from popgen.population.show import describe, render
 
     population = load_population(args.population)
     if args.json:
-        _print_json(
-            {
-                "path": str(population.path),
-                "manifest": population.manifest.model_dump(mode="json"),
-                "members": [
-                    info.model_dump(mode="json") | {"total_steps": info.total_steps} for info in population.members
-                ],
-            }
-        )
+        _print_json(describe(population))
         return OK
-    from rich.table import Table
-
-    info = population.env_info
-    print(f"{len(population)} members, {population.manifest.method}, {info.name} {info.params}")
-    kinds = sorted({kind for member in population.members for kind in member.steps})
-    table = Table("member", "policy", "seed", *(f"{kind} steps" for kind in kinds), "all steps")
-    for member in population.members:
-        counts = [f"{member.steps.get(kind, 0):,}" for kind in kinds]
-        table.add_row(str(member.id), member.kind, str(member.seed), *counts, f"{member.total_steps:,}")
-    _print_table(table)
+    _print_table(render(population))
     print(f"population: {population.path}")
     return OK
 
@@ -264,7 +243,7 @@ def compose(overrides: Sequence[str]) -> dict[str, Any]:
             composed = hydra_compose("config", given)
         missing = sorted(OmegaConf.missing_keys(composed))
         values = OmegaConf.to_container(composed, resolve=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # the last for a number as a group's option
         raise _composition_error(error, overrides) from None
     for key in missing or _unset(values):
         raise UserError(key, "has no value", f"give one with {key}=VALUE")
@@ -284,15 +263,14 @@ def group_options(group: str) -> list[str]:
 def _translate(override: str) -> str:
     """Aliases, and `++` for dictionaries that take any key, so that users need not know Hydra's signs."""
     key, equals, value = override.partition("=")
-    if not equals:
-        if override.startswith("~"):
-            return override
-        raise UserError("overrides", f"cannot read {override!r}", "write KEY=VALUE")
-    if key.lstrip("+").startswith("hydra"):
-        raise UserError(key, "Hydra's own settings have no use here", "leave it out")
-    if key in ALIASES:
-        return f"{ALIASES[key]}={value}"
-    return f"++{override}" if key.startswith(OPEN_SECTIONS) else override
+    if equals and key or override.startswith("~"):
+        if key.lstrip("+").startswith("hydra"):
+            raise UserError(key, "Hydra's own settings have no use here", "leave it out")
+        if key in ALIASES:
+            return f"{ALIASES[key]}={value}"
+        is_open = key in OPEN_SECTIONS or key.startswith(tuple(f"{name}." for name in OPEN_SECTIONS))
+        return f"++{override}" if is_open else override
+    raise UserError("overrides", f"cannot read {_short(override)!r}", "write KEY=VALUE")
 
 
 def _unset(values: Any, prefix: str = "") -> list[str]:
@@ -322,6 +300,9 @@ def _composition_error(error: Exception, overrides: Sequence[str]) -> UserError:
         return UserError(
             "overrides", f"{text.partition(chr(10))[0].rpartition(' ')[2].strip(chr(39))!r} has several values", fix
         )
+    if text.startswith("Config group override"):  # a number or nothing where a name belongs
+        groups = {override.partition("=")[0]: override.partition("=")[2] for override in overrides}
+        return next(_unknown_option(group, option) for group, option in groups.items() if group_options(group))
     if text.startswith("Could not override '"):
         return unknown_field(text.split("'")[1])
     first = text.partition("\n")[0]
@@ -428,7 +409,8 @@ def _add_population_commands(commands: Any) -> None:
         "show",
         _show,
         "what a population holds",
-        "Keys of --json: path, manifest, members (member.json and total_steps).",
+        "Keys of --json: path, manifest, bytes (of all members' files), steps (by kind), total_steps, members "
+        "(member.json with total_steps, bytes and parameters).",
     )
     show.add_argument("population", metavar="POPULATION", help="folder that holds manifest.json")
 

@@ -56,6 +56,12 @@ class EnvConfig(Schema):
     name: str = "overcooked/cramped_room"
     params: dict[str, Any] = {}
 
+    @model_validator(mode="after")
+    def _seed_is_the_runs(self) -> EnvConfig:
+        if "seed" in self.params:
+            raise UserError("params.seed", "environments take the run's seed", "set run.seed")
+        return self
+
 
 class PopulationConfig(Schema):
     """Size of the population and, for continuing one, the run whose members it starts from."""

@@ -92,13 +92,13 @@ def check_cluster(cluster: ClusterConfig) -> None:
 
 
 def check_root(root: Path, needed: int, field: str = "run.root") -> None:
-    """A folder to write to must be (or become) a writable folder with room for `needed` bytes."""
+    """A folder to write to must be writable, or be made in one that is, with room for `needed` bytes."""
     fix = "choose another folder"
     try:
-        root.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=root, prefix=".popgen-"):
+        there = next(folder for folder in (root, *root.absolute().parents) if folder.exists())
+        with tempfile.NamedTemporaryFile(dir=there, prefix=".popgen-"):
             pass
-        free = shutil.disk_usage(root).free
+        free = shutil.disk_usage(there).free
     except OSError as error:
         raise UserError(field, f"cannot write to {root} ({error.strerror or error})", fix) from None
     if free < needed:
@@ -144,13 +144,6 @@ def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
     if window > spec.horizon:
         problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
         raise UserError("world_model.length", f"{problem} ({spec.horizon})", "shorten them")
-    first = config.phase1
-    if first.steps_per_iteration < window:
-        problem = f"{first.steps_per_iteration} is shorter than the windows of {window} steps that are drawn of them"
-        raise UserError("phase1.steps_per_iteration", problem, "raise it or lower world_model.length")
-    if first.prefill_steps < window * first.envs:
-        problem = f"{first.prefill_steps:,} in {first.envs} environments are less than a window of {window} steps each"
-        raise UserError("phase1.prefill_steps", problem, "raise it or lower phase1.envs")
     added = max(phase.episodes_sp, phase.episodes_xp) * (spec.horizon + 1)
     if config.replay.capacity < added:
         problem = f"cannot hold the {added:,} steps that phase2 adds at once"

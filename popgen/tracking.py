@@ -7,6 +7,7 @@ but to that store.
 
 from __future__ import annotations
 
+import http.client
 import logging
 import os
 import time
@@ -54,7 +55,7 @@ def check_uri(uri: str | None, timeout: float = 5.0) -> None:
         urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=timeout).close()
     except urllib.error.HTTPError:
         return  # it answered; /health may be closed by a proxy
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, http.client.HTTPException) as error:
         raise UserError(
             "tracking.uri", f"no server answers at {uri} ({error})", "start it or use tracking=sqlite"
         ) from None

@@ -81,6 +81,17 @@ BAD_OVERRIDES = {
     "several values": (["agent.lambda_xp=0.1,0.2"], "agent.lambda_xp=0.1,0.2"),
     "missing interpolation": (["agent.lambda_xp=${nothing}"], "agent.lambda_xp"),
     "section replaced by a number": (["agent=3"], "agent"),
+    "group replaced by a number": (["env=5"], "overcooked/cramped_room"),
+    "group replaced by nothing": (["scale=null"], "choose one of demo, laptop, paper, smoke"),
+    "no key": (["=5"], "KEY=VALUE"),
+    "key without end": (["a" * 100_000 + "=1"], "aaa"),
+    "reserved parameter": (["env.params.num_envs=1"], "env.params.num_envs"),
+    "parameter of our own": (["env.params.self=1"], "env.params.self"),
+    "seed of the environment alone": (["env.params.seed=1"], "set run.seed"),
+    "fewer processors than actors ask for": (["cluster.num_cpus=1"], "the actors ask for 1.9"),
+    "graphics cards that are not there": (["cluster.model_gpus=77"], "77 GPUs"),
+    "resource of no local Ray": (["cluster.resources={tpu: 1}"], "cluster.resources.tpu"),
+    "address with a space": (["tracking.uri='http://a b'"], "tracking.uri"),
     "mandatory value": (["agent.units=???"], "agent.units"),
     "unknown scale": (["scale=huge"], "choose one of demo, laptop, paper, smoke"),
     "unknown method": (["method=lipo2"], "method"),
@@ -136,6 +147,8 @@ BAD_ARGUMENTS = {
     "population missing": ["evaluate"],
     "no population there": ["evaluate", "nowhere"],
     "no population to show": ["show", "nowhere"],
+    "a path without end": ["show", "x" * 5000],
+    "more environments than memory": ["bench", "env", "--envs", "999999999", "--seconds", "0.01"],
     "a folder that is no population": ["show", "."],
     "no episodes": ["evaluate", ".", "--episodes", "0"],
     "episodes in words": ["evaluate", ".", "--episodes", "many"],
@@ -161,6 +174,8 @@ BAD_FOR_THE_POPULATION = {
     "another horizon": (["--param", "horizon=400"], "overcooked/cramped_room"),
     "unknown layout": (["--env", "overcooked/nowhere"], "nowhere"),
     "unknown member": (["--members", "1,3"], "member 3"),
+    "reserved parameter": (["--param", "layout=x"], "env.params.layout"),
+    "more episodes than memory": (["--episodes", "2000000000"], "memory"),
     "the same member twice": (["--members", "1,1"], "members"),
     "report below a file": (["--out", "file/report"], "--out"),
 }
@@ -240,6 +255,12 @@ def test_a_start_is_compared_by_its_own_config_which_may_be_of_another_version(
         refused(run("run", *start), "population.init_from", "config.json")
     path.unlink()
     refused(run("run", *start), "population.init_from", "config.json")
+
+
+@pytest.mark.usefixtures("no_ray")
+def test_a_dry_run_leaves_nothing(run: Run, tmp_path: Path) -> None:
+    assert run(*DRY, "scale=smoke", "run.root=new/runs")[0] == 0
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("no_ray")
@@ -338,8 +359,9 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
 def test_show(run: Run, random_population: Path) -> None:
     code, out, err = run("show", str(random_population), "--json")
     shown = json.loads(out)
-    assert (code, err) == (0, "") and set(shown) == {"path", "manifest", "members"}
-    assert [member["total_steps"] for member in shown["members"]] == [110, 210]
+    assert (code, err) == (0, "")
+    assert set(shown) == {"path", "manifest", "bytes", "steps", "total_steps", "members"}
+    assert [member["total_steps"] for member in shown["members"]] == [110, 210] and shown["total_steps"] == 320
     assert shown["manifest"]["environment"]["cooking"] == "auto"
     code, out, _ = run("show", str(random_population))
     assert code == 0 and "overcooked/cramped_room" in out and "210" in out

@@ -153,3 +153,22 @@ def test_csv(tmp_path: Path) -> None:
     lines = (tmp_path / "totals.csv").read_text().splitlines()
     assert lines[0] == "member,kind,steps,episodes,score"
     assert lines[1] == "1,SP,202,2,6.0" and len(lines) == 5
+
+
+def test_lost_work_is_set_aside(tmp_path: Path) -> None:
+    path = tmp_path / "ledger.jsonl"
+    ledger = filled(path)
+    with pytest.raises(ValueError, match="9 of 8"):
+        ledger.cut(9)
+    assert ledger.cut(8) == 0 and not (tmp_path / "ledger.lost.jsonl").exists()
+    assert ledger.cut(5) == 3 and ledger.cut(5) == 0
+    for kept in (ledger, Ledger(path)):
+        assert list(kept) == entries(8)[:5] and kept.steps() == sum(range(100, 105))
+        assert kept.steps(member=2) == 104 and kept.steps(kind=Kind.XP) == 101 + 103
+    assert list(Ledger(tmp_path / "ledger.lost.jsonl")) == entries(8)[5:]
+    again = replace(entries(8)[5], steps=7)  # the work is done again, with another outcome
+    assert ledger.record(again)
+    ledger.flush()
+    assert ledger.cut(4) == 2
+    lost = (tmp_path / "ledger.lost.jsonl").read_text().splitlines()
+    assert [json.loads(line)["steps"] for line in lost] == [105, 106, 107, 104, 7]

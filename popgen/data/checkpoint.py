@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from popgen.errors import UserError
 
@@ -17,18 +17,27 @@ ARRAYS, VALUES = "arrays.safetensors", "values.json"
 
 
 def save_state(folder: str | Path, state: dict[str, Any]) -> None:
-    """Write `state` so that `load_state` finds either the old contents or the new, whatever interrupts it."""
+    """Write `state` so that `load_state` finds either the old contents or the new, whatever interrupts it.
+
+    Raises:
+        OSError: it cannot be written, the disk being full for one; the old contents are there.
+    """
     folder = Path(folder)
     fresh = folder.with_name(folder.name + ".writing")
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     arrays: dict[str, np.ndarray] = {}
     values = _split(state, "", arrays)
-    save_file(arrays, str(fresh / ARRAYS))
-    (fresh / VALUES).write_text(json.dumps(values))
-    for path in fresh.iterdir():
-        with open(path, "rb") as file:
-            os.fsync(file.fileno())
+    try:
+        # Not safetensors' own writer, whose errors tell nothing of the disk.
+        for name, data in ((ARRAYS, save(arrays)), (VALUES, json.dumps(values).encode())):
+            with open(fresh / name, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+    except OSError:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
     old = _old(folder)
     if folder.exists():
         shutil.rmtree(old, ignore_errors=True)

@@ -27,6 +27,10 @@ FAMILIES: dict[str, Callable[[str, int, int, dict[str, Any]], BatchedEnv]] = {
 }
 
 
+_GIVEN = {"self", "layout", "variant", "num_envs", "seed"}
+"""Arguments of the environments that `make_env` gives."""
+
+
 def env_names() -> list[str]:
     """Names that need no further parameters: the tested entries of the registry."""
     layouts = (
@@ -39,7 +43,7 @@ def env_names() -> list[str]:
     return [f"overcooked/{layout}" for layout in layouts] + ["rendezvous/mppmr"]
 
 
-def make_env(name: str, num_envs: int = 1, *, seed: int = 0, **params: Any) -> BatchedEnv:
+def make_env(name: str, num_envs: int = 1, /, *, seed: int = 0, **params: Any) -> BatchedEnv:
     """Build B environments of a registered family.
 
     Raises:
@@ -50,6 +54,8 @@ def make_env(name: str, num_envs: int = 1, *, seed: int = 0, **params: Any) -> B
         raise UserError("env.name", f"unknown environment {name!r}", f"choose one of {', '.join(env_names())}")
     if num_envs < 1:
         raise UserError("num_envs", f"must be at least 1, got {num_envs}")
+    if reserved := sorted(_GIVEN & params.keys()):
+        raise UserError(f"env.params.{reserved[0]}", "is no parameter of an environment", "leave it out")
     try:
         return FAMILIES[family](variant, num_envs, seed, params)
     except TypeError as error:

@@ -101,7 +101,7 @@ def test_a_damaged_checkpoint_is_one_line(tmp_path: Path, how: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("fault", ["save_file", "fsync", "rename"])
+@pytest.mark.parametrize("fault", ["save", "fsync", "rename"])
 def test_an_interrupted_save_leaves_the_old_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
     folder = tmp_path / "c"
     save_state(folder, state(0))
@@ -110,8 +110,8 @@ def test_an_interrupted_save_leaves_the_old_state(tmp_path: Path, monkeypatch: p
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch:
-        if fault == "save_file":
-            patch.setattr(checkpoint, "save_file", fail)
+        if fault == "save":
+            patch.setattr(checkpoint, "save", fail)
         elif fault == "fsync":
             patch.setattr(os, "fsync", fail)
         else:

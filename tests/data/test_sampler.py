@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small import kitchen
 
-from popgen.data.sampler import Episode, Sampler, Team
+from popgen.data.sampler import Episode, Sampler, Team, split_teams
 from popgen.envs import BatchedEnv, make_env
 from popgen.policies.simple import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind, Segment
@@ -167,3 +167,51 @@ def test_the_same_seed_gives_the_same_play() -> None:
 def test_teams_must_fill_the_batch() -> None:
     with pytest.raises(ValueError, match="teams ask for 7 environments, the batch has 6"):
         random_sampler(kitchen(6))
+
+
+def test_teams_are_split_evenly_and_in_order() -> None:
+    for parts in (1, 2, 3, 4, 7, 9):
+        shares = split_teams(TEAMS, parts)
+        sizes = [sum(team.envs for team in share) for share in shares]
+        assert sum(sizes) == COUNT and max(sizes) - min(sizes) <= 1 and sizes == sorted(sizes, reverse=True)
+        seats = [team.members for share in shares for team in share for _ in range(team.envs)]
+        assert seats == [team.members for team in TEAMS for _ in range(team.envs)]
+        assert all(team.envs > 0 for share in shares for team in share)
+    assert split_teams(TEAMS, 1) == [TEAMS]
+    assert split_teams(TEAMS, 2) == [[TEAMS[0], Team(Kind.XP, (1, 2), 2)], [Team(Kind.XP, (1, 2), 1), TEAMS[2]]]
+
+
+class Pacing:
+    """Turns through the actions; it must remember where it is."""
+
+    kind, view = "pacing", "features"
+
+    def reset(self, batch: int, seed: int) -> None:
+        self.turn = np.arange(batch) + seed % 5
+
+    def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+        self.turn += 1
+        return np.stack([self.turn % 5, (self.turn // 2) % 5], -1).astype(np.uint8)
+
+    def memory(self) -> dict[str, Any]:
+        return {"turn": self.turn.copy()}
+
+    def load_memory(self, memory: dict[str, Any]) -> None:
+        self.turn = np.array(memory["turn"])
+
+
+def test_a_restored_sampler_goes_on_in_the_middle_of_its_episodes() -> None:
+    """In a task whose resets are random, with a policy that remembers."""
+
+    def make() -> Sampler:
+        env = narrow_rendezvous(COUNT)
+        return Sampler(env, TEAMS, {1: Pacing(), 2: Pacing()}, name="s", seed=3, stagger=True)  # type: ignore[dict-item]
+
+    sampler, restored = make(), make()
+    sampler.collect(37)
+    restored.load_state(sampler.state())
+    for _ in range(2):
+        (segments, episodes), (again, episodes_again) = sampler.collect(30), restored.collect(30)
+        for one, two in zip(segments, again, strict=True):
+            assert np.array_equal(one.states, two.states) and np.array_equal(one.actions, two.actions)
+        assert [e.score for e in episodes] == [e.score for e in episodes_again] and len(episodes) > 10

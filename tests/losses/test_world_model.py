@@ -23,6 +23,16 @@ def test_bernoulli_reconstruction_by_hand() -> None:
     assert loss.shape == (1, 1) and float(loss) == pytest.approx(-math.log(0.75) - math.log(0.5))
 
 
+def test_counts_weigh_as_the_root_of_the_largest() -> None:
+    # One plane of 0 and 1, one of counts up to 16; shares 1 and 4 / 16, probabilities 0.75 and 0.5.
+    outputs, target = torch.tensor([math.log(3.0), 0.0]).reshape(1, 1, 2), torch.tensor([1.0, 0.25]).reshape(1, 1, 2)
+    loss = losses.reconstruction(outputs, target, binary=True, largest=torch.tensor([1.0, 16.0]))
+    assert float(loss) == pytest.approx(-math.log(0.75) - 4 * math.log(0.5))
+    outputs.requires_grad_()
+    losses.reconstruction(outputs, target, binary=True, largest=torch.tensor([1.0, 16.0])).sum().backward()
+    torch.testing.assert_close(outputs.grad.flatten(), torch.tensor([0.75 - 1.0, 4 * (0.5 - 0.25)]))
+
+
 def test_gaussian_reconstruction_sums_over_players_and_pixels() -> None:
     means, target = torch.zeros(2, 3, 2, 4, 5), torch.zeros(2, 3, 2, 4, 5)
     target[1, 2, 0, 1, 1], target[1, 2, 1, 3, 4] = 2.0, 1.0

@@ -46,6 +46,14 @@ def test_gru_by_hand() -> None:
     assert after == pytest.approx(update * candidate + (1 - update) * 3.0, rel=1e-5)
 
 
+def test_every_cell_of_the_decoded_grid_has_a_bias_of_its_own() -> None:
+    decoder = ConvDecoder(11, (5, 4, 6), channels=3, kernels=(5, 3), activation="silu", norm=True)
+    with torch.no_grad():
+        decoder.layers[-1].weight.zero_()
+        decoder.bias.copy_(torch.arange(120.0).reshape(5, 4, 6))
+    assert torch.equal(decoder(torch.rand(2, 11))[1], decoder.bias)
+
+
 def test_convolutions_keep_the_grid() -> None:
     shape, options = (5, 4, 6), {"channels": 3, "kernels": (5, 3, 3), "activation": "silu", "norm": False}
     encoder = ConvEncoder(shape, **options)

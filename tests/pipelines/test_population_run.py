@@ -34,6 +34,8 @@ from popgen.population import Population, load_population
 from popgen.progress import NullReporter
 from popgen.types import Kind
 
+pytestmark = pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")  # as in the actors
+
 HORIZON = 40
 THREE = ("cluster.samplers=3", "cluster.sampler_cpus=0.05")
 
@@ -261,6 +263,18 @@ def test_a_ring_that_is_full_is_restored_from_a_whole_copy(cluster: None, root: 
     names = {path.name for path in (root / "ring" / "checkpoints").iterdir()}
     assert names == {"progress", "base_000001", "segments_000001", "segments_000002", "segments_000003"}
     assert sha256s(launch(root, "ring", *small)) == sha256s(unbroken)
+
+
+def test_several_samplers_share_the_work_and_give_the_same_twice(cluster: None, root: Path) -> None:
+    runs = [launch(root, f"shared{number}", *THREE) for number in range(2)]
+    assert sha256s(runs[0]) == sha256s(runs[1]) and runs[0].ledger() == runs[1].ledger()
+    steps: Counter[tuple[int, str]] = Counter()
+    for entry in Ledger(runs[0].dir / "ledger.jsonl"):
+        steps[entry.member, entry.sampler.partition(".")[0]] += entry.steps
+    # Four environments make shares of 2, 1 and 1 in member 1's 2,400 steps, four episodes the same for member 2's.
+    assert [steps[1, f"sampler{i}"] for i in range(3)] == [1200, 600, 600]
+    assert [steps[2, f"sampler{i}"] for i in range(3)] == [2 * 2 * HORIZON, 2 * HORIZON, 2 * HORIZON]
+    check_ledger(runs[0])
 
 
 def test_a_damaged_checkpoint_is_told_in_one_line(whole: Run, root: Path) -> None:

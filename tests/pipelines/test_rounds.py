@@ -114,3 +114,25 @@ def test_async_lets_nobody_run_far_ahead_and_finishes_what_it_started(scripted: 
 @pytest.mark.parametrize("schedule", ["sync", "async"])
 def test_nothing_starts_when_there_is_nothing_to_do(scripted: Scripted, schedule: str) -> None:
     assert Log(0, scripted).run(schedule) == {"a": 0, "b": 0, "c": 0}
+
+
+@pytest.mark.parametrize("schedule", ["sync", "async"])
+def test_nothing_is_at_work_while_saving(scripted: Scripted, schedule: str) -> None:
+    scripted.slow = "b"
+    log, saved = Log(6, scripted), []
+
+    def save() -> None:
+        assert log.started == log.finished
+        saved.append(log.rounds)
+        log.events.append(("save", log.rounds))
+
+    done = rounds.run_rounds(
+        log.work(),
+        stop=lambda: log.rounds >= 6,
+        after=log.after,
+        schedule=schedule,
+        due=lambda: log.rounds % 2 == 0,
+        save=save,
+    )
+    assert done == log.finished == log.started and len(saved) == 3
+    assert saved == [2, 4, 6] if schedule == "sync" else saved[0] >= 2

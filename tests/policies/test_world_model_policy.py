@@ -177,3 +177,21 @@ def test_the_policy_that_samplers_get_is_filter_and_actor() -> None:
     merged = w.prefixed("filter", w.weights_of(other.filter)) | w.prefixed("actor", w.weights_of(other.actor))
     policy.load(merged)
     assert np.array_equal(play(policy), play(other))
+
+
+def test_memory_goes_on_in_the_middle_of_an_episode() -> None:
+    from popgen.policies.base import Remembering
+
+    env, policy, other = kitchen(3), make_policy(), make_policy()
+    assert isinstance(policy, Remembering)
+    with pytest.raises(RuntimeError, match="before reset"):
+        policy.memory()
+    obs, actions, first = env.observe(), np.zeros((3, 2), np.uint8), np.ones(3, bool)
+    policy.reset(3, seed=5)
+    for _ in range(4):
+        actions, first = policy.act(obs, actions, first), np.zeros(3, bool)
+    other.load_memory(policy.memory())
+    for _ in range(6):
+        ours, theirs = policy.act(obs, actions, first), other.act(obs, actions, first)
+        np.testing.assert_array_equal(ours, theirs)
+        actions = ours

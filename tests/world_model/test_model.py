@@ -156,6 +156,40 @@ def test_output_biases_start_at_the_means_of_the_data() -> None:
     assert (model.continuation(latent) > 0.95).all()
 
 
+def test_lossless_outputs_start_at_the_means_too_and_grids_are_centred() -> None:
+    model = make_model(MODEL.model_copy(update={"view": "lossless", "cnn_channels": 2, "cnn_kernels": (3,)}))
+    obs = model.filter.scaled(window(40, 6, view="lossless")[0])
+    with torch.no_grad():
+        for decoder in model.decoders:
+            decoder.conv.layers[-1].weight.zero_()
+    model.set_outputs(obs, torch.zeros(6, 40, 2 * SPEC.num_events))
+    mean = obs.mean((0, 1))
+    torch.testing.assert_close(torch.sigmoid(model.decode(random_latent(3))[1]), mean.clamp(1e-3, 1 - 1e-3))
+    seen: list[Tensor] = []
+    model.filter.encoder.conv.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    model.filter.encoder(obs.flatten(0, 1))
+    assert float(seen[0].mean(0).abs().max()) < 1e-5 and float(seen[0].std()) > 0.01
+
+
+@pytest.mark.parametrize(("view", "channel"), [("features", None), ("lossless", 20), ("lossless", 21)])
+def test_the_likelihood_is_best_at_the_observation_itself(view: str, channel: int | None) -> None:
+    """Also between two counts that differ by one: 20 is the channel of the steps left to cook, 21 is binary."""
+    model = make_model(MODEL.model_copy(update={"view": view, "cnn_channels": 2, "cnn_kernels": (3,)}))
+    largest = 1.0 if channel is None else float(model.filter.maxima[channel])
+    obs = torch.zeros(1, 1, 2, *SPEC.views[view].shape)
+    losses = []
+    for count in np.arange(0.0, largest + 1):
+        obs[0, 0, 0, ..., channel] = count / largest
+        shares = torch.arange(largest + 1) / largest
+        found = []
+        for share in shares:
+            decoded = torch.full_like(obs, -9.0)
+            decoded[0, 0, 0, ..., channel] = torch.logit(share, eps=1e-4)
+            found.append(float(model.observation_loss(decoded, obs)))
+        losses.append(int(np.argmin(found)))
+        assert len(losses) == count + 1 and losses[-1] == count
+
+
 def test_exact_needs_every_number_of_both_players() -> None:
     model = make_model()
     obs = (torch.rand(3, 2, *SPEC.views["features"].shape, generator=generator()) > 0.5).float()

@@ -1,0 +1,56 @@
+"""A run's folder after an accident."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.books import Books
+from pipelines.report import training_curves
+from popgen.config import RunConfig, RunSection, TrackingConfig
+from popgen.envs import make_env
+from popgen.errors import UserError
+
+SPEC = make_env("overcooked/cramped_room").spec
+
+
+def books(root: Path, **agent: Any) -> Books:
+    config = RunConfig(run=RunSection(root=str(root), id="r"), tracking=TrackingConfig(enabled=False))
+    return Books(config.model_copy(update={"agent": config.agent.model_copy(update=agent)}), SPEC)
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"agent": {"lambda_warmup": 3}}', '{"seed"'])
+def test_a_config_that_cannot_be_read_is_told_in_one_line(content: str, tmp_path: Path) -> None:
+    books(tmp_path)
+    (tmp_path / "r" / "config.json").write_text(content)
+    with pytest.raises(UserError, match=r"run\.id: cannot go on with .*config\.json") as caught:
+        books(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_another_config_needs_another_id(tmp_path: Path) -> None:
+    books(tmp_path)
+    assert books(tmp_path).attempt == 2
+    with pytest.raises(UserError, match="r exists with another config"):
+        books(tmp_path, lambda_xp=0.123)
+
+
+def test_half_a_point_is_dropped_and_repeated_points_count_once(tmp_path: Path) -> None:
+    first = books(tmp_path)
+    for step, score in ((100, 1.0), (200, 2.0), (300, 3.0)):
+        first.log(1, step, real_sp=score)
+    path = tmp_path / "r" / "metrics.jsonl"
+    path.write_text(path.read_text() + '{"member": 1, "st')
+    second = books(tmp_path)
+    for step, score in ((200, 2.5), (350, 4.0)):  # it goes on after step 100
+        second.log(1, step, real_sp=score)
+    second.log(2, 50, real_sp=7.0, real_xp_max=0.5)
+    assert all(json.loads(line) for line in path.read_text().splitlines())
+    assert training_curves(path) == {
+        "member 1, SP": ([100, 200, 350], [1.0, 2.5, 4.0]),
+        "member 2, SP": ([50], [7.0]),
+        "member 2, strongest XP": ([50], [0.5]),
+    }

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import pytest
+
+from pipelines import crew
+from pipelines.play import seed_of
+from popgen.config import ClusterConfig
+from popgen.errors import UserError
+
+HAVE = {"CPU": 8.0, "GPU": 1.0, "simulation": 6.0}
+
+
+def test_a_cluster_that_has_room_is_taken() -> None:
+    crew.check_resources(ClusterConfig(samplers=2, sampler_cpus=3.0, resources={"simulation": 1.0}), HAVE)
+    crew.check_resources(ClusterConfig(samplers=4, sampler_cpus=1.0, model_gpus=0.5, agent_gpus=0.5), HAVE)
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"samplers": 8, "sampler_cpus": 1.0}, "9.8 CPU, the cluster has 8"),
+        ({"model_gpus": 1.0, "agent_gpus": 1.0}, "2 GPU, the cluster has 1"),
+        ({"samplers": 3, "resources": {"simulation": 1.0}}, "7 simulation, the cluster has 6"),
+        ({"resources": {"tpu": 0.1}}, "0.5 tpu, the cluster has 0"),
+    ],
+)
+def test_actors_that_would_wait_for_ever_are_refused(asked: dict, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        crew.check_resources(ClusterConfig(**asked), HAVE)
+
+
+def test_a_cluster_that_does_not_answer_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(**_: object) -> None:
+        raise ConnectionError("Could not find any running Ray instance.")
+
+    monkeypatch.setattr(crew.ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(crew.ray, "init", nobody)
+    with pytest.raises(UserError, match="cluster.address: no Ray answers"):
+        crew.start_ray(ClusterConfig(address="auto"))
+
+
+def test_a_local_ray_has_room_for_all_actors(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[dict] = []
+    monkeypatch.setattr(crew.ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(crew.ray, "init", lambda **options: given.append(options))
+    monkeypatch.setattr(crew.os, "cpu_count", lambda: 1)
+    for cluster in (ClusterConfig(), ClusterConfig(samplers=12, sampler_cpus=1.0), ClusterConfig(num_cpus=7)):
+        assert crew.start_ray(cluster)
+    assert [options["num_cpus"] for options in given] == [2, 14, 7]
+
+
+def test_samplers_have_seeds_of_their_own() -> None:
+    assert seed_of(7, 0) == 7
+    assert len({seed_of(seed, index) for seed in range(20) for index in range(20)}) == 400

@@ -1,0 +1,64 @@
+"""Decisions of member 1's loop, without anything running."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pipelines.first_member import FirstMember
+from popgen.config import Phase1Config, RunConfig
+
+
+def member(**phase: Any) -> FirstMember:
+    """Its window is 16 episodes; the driver has taken no step yet."""
+    config = RunConfig(phase1=Phase1Config(envs=16, **phase))
+    first = FirstMember(SimpleNamespace(config=config, steps=0), seed=0)  # type: ignore[arg-type]
+    first.played, first.published = "played", "published"  # type: ignore[assignment]
+    return first
+
+
+def play(first: FirstMember, *scores: float) -> None:
+    first.recent.extend(scores)
+    first._keep_best()
+
+
+def test_patience_begins_when_there_is_a_window_to_judge_by() -> None:
+    first = member(patience=3, target_score=9.0)
+    for _ in range(15):
+        play(first, 1.0)
+        assert not first._stop() and first.since_best == 0 and first.top is None
+    for waited in range(3):
+        play(first, 1.0)
+        assert first.since_best == waited and not first._stop()
+    play(first, 1.0)
+    assert first.since_best == 3 and first._stop()
+    play(first, *[2.0] * 16)
+    assert first.since_best == 0 and not first._stop()
+
+
+def test_the_target_needs_a_whole_window_and_the_budget_does_not() -> None:
+    first = member(target_score=5.0, max_steps=100)
+    first.recent.extend([8.0] * 15)
+    assert not first._stop()
+    first.recent.append(8.0)
+    assert first._stop()
+    first = member(max_steps=100)
+    first.driver.steps = 100
+    assert first._stop()
+
+
+@pytest.mark.parametrize(("last", "wanted"), [(9.6, "published"), (9.4, "played")])
+def test_the_last_weights_are_taken_unless_those_that_played_best_were_better(last: float, wanted: str) -> None:
+    first = member()
+    play(first, *[10.0] * 16)
+    play(first, *[last] * 16)
+    assert first._best().published == wanted
+
+
+def test_without_a_whole_window_the_last_weights_are_all_there_is() -> None:
+    first = member()
+    assert first._best().published == "published" and first._best().sp == 0.0
+    play(first, 4.0, 2.0)
+    assert first._best().published == "published" and first._best().sp == 3.0
