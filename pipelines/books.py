@@ -20,7 +20,6 @@ from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
 from popgen.nets.weights import Weights
 from popgen.policies.base import Policy
-from popgen.policies.world_model_policy import WorldModelPolicy
 from popgen.population import PopulationWriter, load_population
 from popgen.population.manifest import MemberInfo
 from popgen.types import Kind, LedgerEntry
@@ -49,7 +48,7 @@ class Books:
             seed=config.run.seed,
             resume=True,
         )
-        params = config.model_dump(mode="json")
+        params = config.relevant()
         self.tracker = RemoteTracker(config.tracking, self.dir, self.run_id, params, self._resumed())
 
     def _check_same_config(self) -> None:
@@ -61,7 +60,7 @@ class Books:
                 raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
             if known.digest() != self.config.digest():
                 raise UserError("run.id", f"{self.run_id} exists with another config", "choose another id")
-        _replace(path, json.dumps(self.config.model_dump(mode="json"), indent=1))
+        _replace(path, json.dumps(self.config.relevant(), indent=1))
 
     def _next_attempt(self) -> int:
         path = self.dir / "attempts.txt"
@@ -112,14 +111,10 @@ class Books:
             file.write(json.dumps(row | {k: _rounded(v) for k, v in figures.items()}) + "\n")
         self.tracker.log(figures, step=step, member=member)
 
-    def add_member(
-        self, policy_weights: Weights, training: Weights, *, seed: int, member: int, extra: dict[str, Any]
-    ) -> None:
-        """Save a finished member and what the scaling figure needs."""
-        policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
-        policy.load(policy_weights)
-        steps = self.training_steps(member)
-        self.population.add_member(policy, seed=seed, steps=steps, training=training, extra=extra)
+    def add_member(self, policy: Policy, training: Weights | None, *, seed: int, extra: dict[str, Any]) -> None:
+        """Save the next member, with its steps so far, and enter it in the scaling figure."""
+        member = len(self.population) + 1
+        self.population.add_member(policy, seed=seed, steps=self.training_steps(member), training=training, extra=extra)
         self.tracker.log_scaling(member, sum(self.member_steps()))
         self.save_tracking()
 

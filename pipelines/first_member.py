@@ -18,7 +18,7 @@ from popgen.policies.simple import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
 
 if TYPE_CHECKING:
-    from pipelines.population import Driver
+    from pipelines.xpm_wm import XpmWm
 
 MEMBER = 1
 PREFILL_CHUNK = 400
@@ -32,7 +32,7 @@ class FirstMember:
     What the three kinds of work published last is kept here, as references.
     """
 
-    def __init__(self, driver: Driver, seed: int) -> None:
+    def __init__(self, driver: XpmWm, seed: int) -> None:
         self.driver, self.config, self.phase, self.seed = driver, driver.config, driver.config.phase1, seed
         window = max(16, self.phase.envs // 2)
         self.recent: deque[float] = deque(maxlen=window)

@@ -14,7 +14,7 @@ from popgen.nets.weights import under
 from popgen.types import Kind
 
 if TYPE_CHECKING:
-    from pipelines.population import Driver
+    from pipelines.xpm_wm import XpmWm
 
 PIECE = 50
 """Agent updates between two signs of progress."""
@@ -23,7 +23,7 @@ PIECE = 50
 class LaterMember:
     """Imagination first, then few rounds of real episodes, fine-tuning of the world model and imagination."""
 
-    def __init__(self, driver: Driver, member: int, seed: int) -> None:
+    def __init__(self, driver: XpmWm, member: int, seed: int) -> None:
         self.driver, self.config, self.phase = driver, driver.config, driver.config.phase2
         self.member, self.seed = member, seed
         self.partners = sorted(driver.members)

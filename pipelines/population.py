@@ -1,44 +1,66 @@
-"""The main job: an XPM-WM population, member after member (paper, algorithm 1 and section 4.2)."""
+"""The main job: a population by any method, its evaluation and its report.
+
+A method is a driver: a class that trains the members which the run's books do not hold yet.
+"""
 
 from __future__ import annotations
 
-import math
 import time
-from pathlib import Path
-from typing import Any
+from importlib import import_module
+from typing import Any, Protocol
 
 import numpy as np
 import ray
 
 from actors.common import build_env, settle
-from actors.sampler import Collected, PolicyParts
 from pipelines.books import Books
-from pipelines.checkpoints import Checkpoints, member_folder
-from pipelines.crew import Crew, start_ray
-from pipelines.first_member import FirstMember
-from pipelines.later_member import LaterMember
+from pipelines.crew import start_ray
 from pipelines.report import write_run_figures
-from pipelines.snapshot import Snapshot
 from popgen.config import RunConfig
-from popgen.data.checkpoint import load_state, save_state
-from popgen.data.sampler import Episode
 from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import evaluate_population
 from popgen.evaluation.report import to_dict, write_report
-from popgen.nets.weights import Weights
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.types import Kind
 
-SP_KINDS = (str(Kind.SP), str(Kind.RANDOM))
-XP_KINDS = (str(Kind.XP),)
-LEARNERS = ("model", "agent")
-REPLAYS = ("replay_sp", "replay_xp")
+DRIVERS: dict[str, str] = {
+    "xpm_wm": "pipelines.xpm_wm:XpmWm",
+    "xpm_sim": "pipelines.xpm_sim:XpmSim",
+    "mappo": "pipelines.baselines:Mappo",
+    "lipo": "pipelines.baselines:Lipo",
+    "comedi": "pipelines.baselines:CoMeDi",
+}
+"""method -> `module:class`, imported when first needed."""
+
+
+class Driver(Protocol):
+    """Trains the members of one run."""
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> None:
+        """Books and Ray are open; nothing of the method has started."""
+
+    def run(self) -> None:
+        """Train every member that `books.population` does not hold, and add it with `books.add_member`.
+
+        Every environment step goes to `books.ledger` before the member that it was spent on is added. An
+        interrupted run is the same call again.
+
+        Raises:
+            FloatingPointError: training diverged.
+            UserError: a checkpoint to go on from is damaged.
+        """
+
+
+def driver_class(method: str) -> type[Driver]:
+    """The driver of a method."""
+    module, _, name = DRIVERS[method].partition(":")
+    return getattr(import_module(module), name)
 
 
 def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
-    """Train a population and evaluate it.
+    """Train a population by `config.method` and evaluate it.
 
     Args:
         config: a validated run.
@@ -60,9 +82,8 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         mine = start_ray(config.cluster)
         books.tracker.start()
         books.save_tracking()
-        driver = Driver(config, spec, books, reporter)
-        driver.run()
-        result = driver.finish()
+        driver_class(config.method)(config, spec, books, reporter).run()
+        result = finish(config, spec, books, reporter)
         status = "FINISHED"
         return result
     except KeyboardInterrupt:
@@ -76,195 +97,36 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
             ray.shutdown()
 
 
-class Driver:
-    """Walks through the members; holds what they hand on to each other, and does what all of them need."""
-
-    def __init__(self, config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> None:
-        self.config, self.spec, self.books, self.reporter = config, spec, books, reporter
-        self.crew = Crew.hire(config, f"{books.run_id}.{books.attempt}")
-        long = max(1, config.replay.capacity // 2)
-        self.checkpoints = Checkpoints(books.dir, long=long, seconds=config.run.checkpoint_seconds)
-        self.members: dict[int, Weights] = {}
-        self.steps = 0
-        self.began = time.time()
-
-    # ---- the walk ------------------------------------------------------------------------------------------------
-
-    def run(self) -> None:
-        """Train every member that is not there yet."""
-        try:
-            known, base, saved = self._resume()
-            for member in range(known + 1, self.config.population.size + 1):
-                began, self.steps = time.time(), saved["steps"] if saved else 0
-                seed = self.config.run.seed * 1000 + member
-                if saved is None:
-                    self.checkpoints.begin(base)
-                trainer = FirstMember(self, seed) if member == 1 else LaterMember(self, member, seed)
-                self._complete(member, seed, trainer.train(saved), time.time() - began)
-                base, saved = member_folder(self.books.dir, member), None
-        finally:
-            self.crew.dismiss()
-
-    def _complete(self, member: int, seed: int, snapshot: Snapshot, seconds: float) -> None:
-        """Add the member to the population, keep the buffers and the model, enter it in the books."""
-        weights = snapshot.published.weights()
-        training = {f"model.{k}": v for k, v in weights["model"].items() if not k.startswith("filter.")}
-        training |= {f"critics.{k}": v for k, v in weights["critics"].items()}
-        report = ray.get(self.crew.model.report.remote())
-        extra = {"sp": snapshot.sp, "xp": snapshot.xp, "seconds": round(seconds, 1), "world_model": report}
-        self.log(member, final_sp=snapshot.sp, final_xp=snapshot.xp, **report)
-        state = self._replays() | {"model": ray.get(self.crew.model.state.remote())}
-        save_state(member_folder(self.books.dir, member), state | {"ledger": len(self.books.ledger)})
-        self.books.add_member(weights["acting"], training, seed=seed, member=member, extra=extra)
-        self.members[member] = weights["acting"]
-        steps = sum(self.books.training_steps(member).values())
-        self.reporter.note(
-            f"member {member}: SP {snapshot.sp:.2f}, XP {snapshot.xp:.2f} {self.spec.score_name} in training, "
-            f"{steps:,} environment steps, {seconds / 60:.1f} min"
-        )
-
-    # ---- what members are trained with ---------------------------------------------------------------------------
-
-    def parts(self, weights: Weights) -> PolicyParts:
-        """A member's policy as it travels to a sampler."""
-        config = self.config
-        sizes = {
-            "world_model": config.world_model.model_dump(mode="json"),
-            "agent": config.agent.model_dump(mode="json"),
-        }
-        return PolicyParts("world_model", sizes, weights)
-
-    def play(self, member: int, steps: int) -> list[Episode]:
-        """Let all samplers play for `member`'s training, take in what they give; the episodes that ended."""
-        episodes: list[Episode] = []
-        for segments, collected in self.crew.players.collect(steps):
-            self.absorb(member, segments, collected)
-            episodes += collected.episodes
-        return episodes
-
-    def absorb(self, member: int, segments: Any, collected: Collected) -> None:
-        """Segments (a reference) to the buffers and the checkpoint's log, counts to the ledger."""
-        added = self._store(segments, member)
-        self.checkpoints.keep(ray.get(segments), member)
-        ray.get(added)
-        self.books.record(member, collected)
-        self.steps += sum(steps for *_, steps in collected.counts)
-
-    def _store(self, segments: Any, owner: int) -> list[Any]:
-        kinds = ((self.crew.replay_sp, SP_KINDS), (self.crew.replay_xp, XP_KINDS))
-        return [replay.add.remote(segments, owner, kept) for replay, kept in kinds]
-
-    def log(self, member: int, **figures: float) -> None:
-        """A point of metrics at the member's present step.
-
-        Raises:
-            FloatingPointError: a learner's figure is not finite: it will not recover.
-        """
-        self.books.log(member, self.steps, **figures)
-        for name, value in figures.items():
-            if name.partition("/")[0] in LEARNERS and not math.isfinite(value):
-                raise FloatingPointError(f"{name} of member {member} is {value} after {self.steps:,} steps")
-
-    # ---- resume --------------------------------------------------------------------------------------------------
-
-    def save(self, member: int, state: dict[str, Any]) -> None:
-        """The checkpoint between two iterations: the members' part, and what is common to them."""
-        crew = self.crew
-        common = {name: getattr(crew, name).state.remote() for name in LEARNERS}
-        marks = {name: getattr(crew, name).marks.remote() for name in REPLAYS}
-        state = state | dict(zip(common, ray.get([*common.values()]), strict=True))
-        state["marks"] = dict(zip(marks, ray.get([*marks.values()]), strict=True))
-        self.checkpoints.save(member, {**state, "steps": self.steps, "ledger": len(self.books.ledger)}, self._replays)
-
-    def restore_learners(self, saved: dict[str, Any]) -> None:
-        """Buffers, world model and agent as `save` found them; the member must have begun."""
-        crew = self.crew
-        whole = self.checkpoints.replays()
-        for name in REPLAYS if whole else ():
-            ray.get(getattr(crew, name).load_state.remote(whole[name]))
-        for segments, owner in self.checkpoints.log():
-            stored = ray.put(segments)
-            added = (
-                crew.replay_sp.add.remote(stored, owner, SP_KINDS),
-                crew.replay_xp.add.remote(stored, owner, XP_KINDS),
-            )
-            ray.get(list(added))
-        ray.get([getattr(crew, name).load_marks.remote(saved["marks"][name]) for name in REPLAYS])
-        ray.get([getattr(crew, name).load_state.remote(saved[name]) for name in LEARNERS])
-        self.reporter.note(f"going on after {self.steps:,} steps of member {saved['member']}")
-
-    def _replays(self) -> dict[str, Any]:
-        states = ray.get([getattr(self.crew, name).state.remote() for name in REPLAYS])
-        return dict(zip(REPLAYS, states, strict=True))
-
-    def _resume(self) -> tuple[int, Path | None, dict[str, Any] | None]:
-        """Take over finished members of this run, or of the run this one continues.
-
-        Returns:
-            How many; the checkpoint of the last one; the running member's last checkpoint, if there is one.
-        """
-        present, origin = len(self.books.population), self.config.population
-        if origin.init_from and present <= origin.init_members:
-            root, known = Path(origin.init_from), origin.init_members
-        else:
-            root, known = self.books.dir, present
-        saved = self.checkpoints.load(known + 1)
-        if not known:
-            self._forget(saved["ledger"] if saved else 0)
-            return 0, None, saved
-        folder = member_folder(root, known)
-        state = load_state(folder)
-        self._forget(saved["ledger"] if saved else state.get("ledger") if root == self.books.dir else 0)
-        if saved is None:
-            ray.get([getattr(self.crew, name).load_state.remote(state[name]) for name in (*REPLAYS, "model")])
-        self._take_over(root, known, present)
-        return known, folder, saved
-
-    def _take_over(self, root: Path, known: int, present: int) -> None:
-        source = load_population(root / "population")
-        for member in range(1, known + 1):
-            self.members[member] = source[member].weights()
-            if member > present:
-                self.books.adopt(source[member], source.info(member), source.training(member))
-        self.reporter.note(f"going on after member {known} of {root}")
-
-    def _forget(self, entries: int | None) -> None:
-        """Work that no checkpoint holds will be done again: its steps leave the ledger (None: unknown, all stay)."""
-        if entries is not None and (lost := self.books.ledger.cut(entries)):
-            self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
-
-    # ---- the end -------------------------------------------------------------------------------------------------
-
-    def finish(self) -> dict[str, Any]:
-        """Evaluate the population, write the report, return the summary (keys: see `run_population`)."""
-        path, config, books = self.books.dir / "population", self.config, self.books
-        self.reporter.phase("evaluation", 1)
-        result = evaluate_population(
-            load_population(path),
-            config.evaluation.episodes,
-            config.run.seed,
-            progress=lambda done, total: self.reporter.update(done / total, episodes=done),
-        )
-        files = write_report(result, books.dir / "report")
-        size = len(books.population)
-        episodes = result.episodes * len(result.pairings)
-        books.record_steps(size, Kind.EVALUATION, f"evaluation.{books.attempt}", 0, result.steps, episodes)
-        files |= write_run_figures(
-            books.dir, books.dir / "report", books.member_steps(), unit=self.spec.score_name, title=self.spec.name
-        )
-        for file in files.values():
-            books.tracker.log_artifact(file, "report")
-        figures = {"sp": result.sp.mean, "xp": result.xp.mean}
-        books.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
-        evaluation = to_dict(result)
-        return {
-            "run_id": books.run_id,
-            "run_dir": str(books.dir),
-            "population": str(path),
-            "members": size,
-            "ledger": books.ledger.table(),
-            "matrix": evaluation["matrix"],
-            "evaluation": evaluation,
-            "files": {suffix: str(file) for suffix, file in files.items()},
-            "seconds": round(time.time() - self.began, 1),
-        }
+def finish(config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> dict[str, Any]:
+    """Evaluate the population, write the report, return the summary (keys: see `run_population`)."""
+    path = books.dir / "population"
+    reporter.phase("evaluation", 1)
+    result = evaluate_population(
+        load_population(path),
+        config.evaluation.episodes,
+        config.run.seed,
+        progress=lambda done, total: reporter.update(done / total, episodes=done),
+    )
+    files = write_report(result, books.dir / "report")
+    size = len(books.population)
+    episodes = result.episodes * len(result.pairings)
+    books.record_steps(size, Kind.EVALUATION, f"evaluation.{books.attempt}", 0, result.steps, episodes)
+    files |= write_run_figures(
+        books.dir, books.dir / "report", books.member_steps(), unit=spec.score_name, title=spec.name
+    )
+    for file in files.values():
+        books.tracker.log_artifact(file, "report")
+    figures = {"sp": result.sp.mean, "xp": result.xp.mean}
+    books.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
+    evaluation = to_dict(result)
+    return {
+        "run_id": books.run_id,
+        "run_dir": str(books.dir),
+        "population": str(path),
+        "members": size,
+        "ledger": books.ledger.table(),
+        "matrix": evaluation["matrix"],
+        "evaluation": evaluation,
+        "files": {suffix: str(file) for suffix, file in files.items()},
+        "seconds": round(time.time() - books.began, 1),
+    }

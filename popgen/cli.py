@@ -78,7 +78,7 @@ def _run(args: argparse.Namespace) -> int:
     config = RunConfig.parse(compose(args.overrides))
     preflight(config)
     if args.dry_run:
-        return _print_config(config.model_dump(mode="json"), args.json)
+        return _print_config(config.relevant(), args.json)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     _bound_threads(config.cluster.threads)
     from pipelines.population import run_population

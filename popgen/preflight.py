@@ -32,16 +32,17 @@ def preflight(config: RunConfig) -> None:
             unsafe run id, a root that cannot be written, or too little disk or memory.
     """
     spec = _build(config)
-    _check_view(config, spec)
-    _check_rewards(config, spec)
     check_run_id(config.run.id)
-    _check_lengths(config, spec)
-    check_cluster(config.cluster)
+    if config.method == "xpm_wm":
+        _check_view(config, spec)
+        _check_rewards(config, spec)
+        _check_lengths(config, spec)
+        check_cluster(config.cluster)
+        check_memory(config, spec)
     if config.tracking.enabled:
         check_uri(config.tracking.uri)
     if config.population.init_from is not None:
         _check_start(config, spec)
-    check_memory(config, spec)
     check_root(Path(config.run.root), disk_bytes(config, spec))
 
 
@@ -62,6 +63,8 @@ def buffer_bytes(config: RunConfig, spec: EnvSpec) -> int:
 
 def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
     """Bytes of the run's folder at most: both buffers for each member, in two copies and a log for the running one."""
+    if config.method != "xpm_wm":
+        return MARGIN
     return (config.population.size + 4) * buffer_bytes(config, spec) + MARGIN
 
 
@@ -151,6 +154,8 @@ def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
 
 
 def _check_start(config: RunConfig, spec: EnvSpec) -> None:
+    if config.method != "xpm_wm":
+        raise UserError("population.init_from", f"{config.method} has no use for it", "leave it out")
     from popgen.population import check_compatible, load_population
 
     run, wanted = Path(str(config.population.init_from)), config.population.init_members

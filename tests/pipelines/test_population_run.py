@@ -18,7 +18,8 @@ import ray
 from local_crew import LocalCrew
 
 from actors.sampler import Collected
-from pipelines import population as pipeline
+from pipelines import population as main_job
+from pipelines import xpm_wm as pipeline
 from pipelines.books import Books
 from pipelines.checkpoints import Checkpoints
 from pipelines.later_member import LaterMember
@@ -129,7 +130,7 @@ def launch(root: Path, name: str, *overrides: str, local: bool = True, die_at: s
             super().save(*given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "Books", Listening)
+        patch.setattr(main_job, "Books", Listening)
         patch.setattr(pipeline, "Checkpoints", Mortal)
         if local:
             patch.setattr(pipeline, "Crew", LocalCrew)
@@ -323,7 +324,7 @@ def test_a_run_that_goes_on_from_another_can_be_interrupted_before_its_first_own
     for attempt in (1, 2):
         loaded.clear()
         books = Books(config, whole.population.spec)
-        driver = pipeline.Driver(config, whole.population.spec, books, NullReporter())
+        driver = pipeline.XpmWm(config, whole.population.spec, books, NullReporter())
         with monkeypatch.context() as patch:
             patch.setattr(ray, "get", lambda references: references)
             known, base, saved = driver._resume()
