@@ -9,8 +9,8 @@ from torch import Tensor
 def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, *, clip: float) -> Tensor:
     """-min(r A, clip(r, 1 - c, 1 + c) A) with r = pi / pi_old, elementwise, to be minimised.
 
-    The advantage carries the objective's sign already (`losses.diversity.signed_advantage`): where cross-play returns are
-    minimised, -A stands here, so that the clipping bounds the step that lowers them. `advantage` carries no gradient.
+    The advantage carries the objective's sign already (`losses.diversity.signed_advantage`): where cross-play returns
+    are minimised, -A stands here, so that the clipping bounds the step that lowers them. It carries no gradient.
     """
     ratio = torch.exp(log_prob - old_log_prob.detach())
     advantage = advantage.detach()
@@ -20,6 +20,7 @@ def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor,
 def negated_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, *, clip: float) -> Tensor:
     """+min(r A, clip(r) A): what two published code bases minimise for cross-play, kept to reproduce their numbers.
 
-    Its improving direction is not clipped: for A > 0 the ratio can fall to 0 within one batch, for A < 0 it can grow without bound.
+    Its improving direction is not clipped: for A > 0 the ratio can fall to 0 within one batch, for A < 0 it can grow
+    without bound.
     """
     return -clipped_surrogate(log_prob, old_log_prob, advantage, clip=clip)

@@ -23,13 +23,13 @@ def test_the_surrogate_by_hand(ratio: float, advantage: float, loss: float, slop
     old = torch.tensor(-1.3)
     log_prob = (old + math.log(ratio)).requires_grad_()
     value = clipped_surrogate(log_prob, old, torch.tensor(advantage), clip=0.2)
-    assert float(value) == pytest.approx(loss, rel=1e-5)
+    assert float(value.detach()) == pytest.approx(loss, rel=1e-5)
     value.backward()
     assert float(log_prob.grad) == pytest.approx(slope, rel=1e-5)
 
 
 def test_negating_the_clipped_loss_leaves_the_improving_direction_unclipped() -> None:
-    """Lowering a return with A = 2 means lowering pi: at r = 0.5 the signed advantage has stopped, the negated loss has not."""
+    """Lowering a return with A = 2 means lowering pi: at r = 0.5 the signed advantage has stopped, the other not."""
     old = torch.tensor(-1.3)
     for function, advantage, slope in ((clipped_surrogate, -2.0, 0.0), (negated_surrogate, 2.0, 1.0)):
         log_prob = (old + math.log(0.5)).requires_grad_()
