@@ -154,7 +154,7 @@ class FirstMember:
         if self.recent:
             self.figures |= {
                 "real_sp": float(np.mean(self.recent)),
-                "real_reward_sp": float(np.mean(self.shaped)) / driver.spec.horizon,
+                "real_shaped_sp": float(np.mean(self.shaped)) / driver.spec.horizon,
             }
         if self.rounds % self.phase.check_every == 0:
             self.figures |= {f"report/{k}": v for k, v in ray.get(driver.crew.model.report.remote()).items()}

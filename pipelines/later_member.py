@@ -114,7 +114,7 @@ class LaterMember:
             self.member,
             real_sp=snapshot.sp,
             real_xp_max=strongest,
-            real_reward_sp=float(np.mean([e.shaped for e in own])) / horizon,
+            real_shaped_sp=float(np.mean([e.shaped for e in own])) / horizon,
             round=self.number,
         )
         driver.reporter.note(

@@ -143,6 +143,12 @@ def test_lambda_rises_from_its_start_to_its_end() -> None:
     assert [round(score / scores[-1], 4) for score in scores] == [0.2, 0.6, 1.0, 1.0]
 
 
+def test_a_lambda_below_the_starting_one_holds_from_the_first_update_on() -> None:
+    learner = make_learner(lambda_xp=0.1, lambda_start=0.25, lambda_ramp=10)
+    for learner.updates in (0, 5, 10, 50):
+        assert learner.lambda_now() == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize("key", [SELF, 1, 2])
 def test_each_critic_learns_from_its_own_trajectories_and_the_actor_from_no_value_loss(key: int) -> None:
     learner = make_learner()

@@ -222,8 +222,8 @@ def test_episodes_are_those_of_the_steps(whole: Run) -> None:
 def test_metrics_tell_what_training_did(whole: Run) -> None:
     rows = [json.loads(line) for line in (whole.dir / "metrics.jsonl").read_text().splitlines()]
     for member, wanted in (
-        (1, {"model/loss_observation", "agent/entropy", "agent/return_scale", "real_reward_sp", "final_sp"}),
-        (2, {"agent/imagined_reward_sp", "agent/imagined_reward_xp", "real_sp", "real_xp_max", "final_xp"}),
+        (1, {"model/loss_observation", "agent/entropy", "agent/return_scale", "real_shaped_sp", "final_sp"}),
+        (2, {"agent/imagined_shaped_sp", "agent/imagined_shaped_xp", "real_sp", "real_xp_max", "final_xp"}),
     ):
         names = set().union(*(row.keys() for row in rows if row["member"] == member))
         assert wanted <= names and {"event_recall_step1", "event_precision_step4", "exact_posterior"} <= names

@@ -136,12 +136,14 @@ class AgentLearner:
         return Latent(torch.from_numpy(starts.h[rows]).to(self.dtype), z.to(self.dtype))
 
     def lambda_now(self) -> float:
-        """lambda_XP of this update: from `lambda_start` to `lambda_xp` over `lambda_ramp` updates.
+        """lambda_XP of this update: rising from `lambda_start`, if that is less, to `lambda_xp` over
+        `lambda_ramp` updates.
 
         Cross-play pressure must be there from the first update, or the member settles on its predecessor's
         convention; at full strength from the start it keeps self-play from starting at all.
         """
-        start, end, ramp = self.config.lambda_start, self.config.lambda_xp, self.config.lambda_ramp
+        end, ramp = self.config.lambda_xp, self.config.lambda_ramp
+        start = min(self.config.lambda_start, end)
         return end if not ramp else start + (end - start) * min(1.0, self.updates / ramp)
 
     def _imagine(self, partner: int | None) -> tuple[Imagined, Tensor]:
@@ -198,7 +200,7 @@ class AgentLearner:
         metrics = {
             "entropy": float(entropy.detach().mean()),
             "return_scale": float(scale),
-            "imagined_reward_sp": float(imagined.reward.mean()),
+            "imagined_shaped_sp": float(imagined.reward.mean()),
             "imagined_return_sp": float(returns.mean()),
             "value_sp": float(value.mean()),
             "advantage_sp": float(advantage.std()),
@@ -223,7 +225,7 @@ class AgentLearner:
         reward = float(imagined.reward.mean())
         self.imagined_scores[partner] = 0.95 * self.imagined_scores.get(partner, reward) + 0.05 * reward
         metrics = {
-            "imagined_reward_xp": reward,
+            "imagined_shaped_xp": reward,
             "imagined_return_xp": float(returns.mean()),
             "advantage_xp": float(advantage.std()),
             "critic_loss_xp": float(critic_loss.detach()),
