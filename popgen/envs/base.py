@@ -138,6 +138,10 @@ class BatchedEnv(ABC):
         if state:
             raise ValueError("this environment draws nothing")
 
-    def observe(self, view: str = "features") -> np.ndarray:
-        """Observations (B, P, *view.shape) of the current states."""
-        return self.encode(self.get_state(), view)
+    def observe(self, view: str = "features", out: np.ndarray | None = None) -> np.ndarray:
+        """Observations (B, P, *view.shape) of the current states, in `out` if it is given."""
+        seen = self.encode(self.get_state(), view)
+        if out is None:
+            return seen
+        out[...] = seen
+        return out
