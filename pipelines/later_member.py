@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import ray
 
+from pipelines.checkpoints import fitting
 from pipelines.snapshot import Published, Snapshot
 from popgen.algos.xpm_wm.partners import PartnerReturns
 from popgen.data.sampler import Episode, Team
@@ -46,22 +47,29 @@ class LaterMember:
         driver.reporter.phase(f"member {self.member}: imagined self-play and cross-play", total)
         if saved is not None:
             driver.restore_learners(saved)
-            self._restore(saved["later_member"])
-        while self.number < rounds:
+            with fitting(driver.checkpoints.folder):
+                self._restore(saved["later_member"])
+        while self._goes_on(rounds):
             published = self._imagine()
             episodes = self._real_episodes(ray.get(published.acting))
             self.number += 1
             self._judge(published, episodes)
-            if self.number < rounds and driver.checkpoints.due():
+            if self._goes_on(rounds) and driver.checkpoints.due():
                 self._save()
         assert self.best is not None
         return self.best
 
     def rounds(self) -> int:
-        """Rounds of real episodes: those configured, fewer where the environment steps end first."""
+        """Rounds of real episodes at most: those configured, fewer where the environment steps end first."""
         phase = self.phase
+        most = max(phase.rounds, phase.max_rounds or 0)
         each = (phase.episodes_sp + self.episodes_xp) * self.driver.spec.horizon
-        return phase.rounds if phase.max_steps is None else max(1, min(phase.rounds, phase.max_steps // each))
+        return most if phase.max_steps is None else max(1, min(most, phase.max_steps // each))
+
+    def _goes_on(self, most: int) -> bool:
+        """The configured rounds are played in any case, further ones only by a member that is still weak."""
+        weak = self.best is None or self.best.sp < self.phase.target_score
+        return self.number < (most if weak else min(self.phase.rounds, most))
 
     def _imagine(self) -> Published:
         """Fine-tune the world model on the last episodes, refresh the start cache, then learn in imagination."""
@@ -125,7 +133,9 @@ class LaterMember:
     def _save(self) -> None:
         assert self.best is not None
         state = {"best": self.best.state(), "returns": self.returns.state(), "number": self.number}
-        self.driver.save(self.member, {"later_member": state, "samplers": self.driver.crew.players.state()})
+        self.driver.save(
+            self.member, self.number, {"later_member": state, "samplers": self.driver.crew.players.state()}
+        )
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.best, self.number = Snapshot.of(state["best"]), state["number"]

@@ -174,6 +174,8 @@ class Phase2Config(Schema):
     episodes_sp: Batch = 8
     episodes_xp: Batch = 8
     rounds: Positive = 8
+    max_rounds: Positive | None = None  # for a member whose best self-play is below the target; None: no more
+    target_score: Number = 8.0
     max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
     cache: Positive = 8192
     starts_random: Fraction = 0.6

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -22,6 +24,7 @@ from pipelines import population as main_job
 from pipelines import xpm_wm as pipeline
 from pipelines.books import Books
 from pipelines.checkpoints import Checkpoints
+from pipelines.crew import Crew
 from pipelines.later_member import LaterMember
 from pipelines.population import run_population
 from popgen.cli import compose
@@ -70,6 +73,12 @@ class Killed(RuntimeError):
     """Injected where a driver could be killed."""
 
 
+def kill(crew: Crew, who: str) -> None:
+    """kill -9 of an actor's process."""
+    handle = crew.players.samplers[0] if who == "sampler" else getattr(crew, who)
+    os.kill(ray.get(handle.__ray_call__.remote(lambda actor: os.getpid())), signal.SIGKILL)
+
+
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[None]:
     """A Ray of this module's own; its sockets need a short path."""
@@ -99,20 +108,32 @@ def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
     return RunConfig.parse(compose([*base, *overrides]))
 
 
-def launch(root: Path, name: str, *overrides: str, local: bool = True, die_at: str = "") -> Run:
+def launch(
+    root: Path, name: str, *overrides: str, local: bool = True, die_at: str = "", kills: dict[str, str] | None = None
+) -> Run:
     """Run it, listening to what the samplers say; without processes of its own if `local`.
 
     die_at: METHOD:N of the books or the checkpoints; the run dies at the beginning of the N-th call of it.
+    kills: METHOD:N -> the actor whose process is killed then.
     """
     config = smoke(root, name, *overrides)
     collected: list[tuple[int, Collected]] = []
-    method, _, number = die_at.partition(":")
     calls: Counter[str] = Counter()
+    crews: list[Any] = []
 
     def called(name: str) -> None:
         calls[name] += 1
-        if name == method and calls[name] == int(number):
+        now = f"{name}:{calls[name]}"
+        if now == die_at:
             raise Killed(die_at)
+        if kills and now in kills:
+            kill(crews[-1], kills[now])
+
+    class Hired(pipeline.Crew):
+        @staticmethod
+        def hire(*given: Any) -> Any:
+            crews.append((LocalCrew if local else Crew).hire(*given))
+            return crews[-1]
 
     class Listening(Books):
         def record(self, member: int, said: Collected) -> None:
@@ -132,8 +153,7 @@ def launch(root: Path, name: str, *overrides: str, local: bool = True, die_at: s
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main_job, "Books", Listening)
         patch.setattr(pipeline, "Checkpoints", Mortal)
-        if local:
-            patch.setattr(pipeline, "Crew", LocalCrew)
+        patch.setattr(pipeline, "Crew", Hired)
         return Run(run_population(config, reporter=NullReporter()), collected)
 
 
@@ -256,13 +276,37 @@ def test_a_killed_run_ends_as_one_that_was_not(death: str, whole: Run, root: Pat
     assert (len(Ledger(aside)) if aside.exists() else 0) == lost
 
 
+def test_a_run_goes_on_by_itself_when_its_actors_are_killed(whole: Run, root: Path) -> None:
+    """The calls go on over all attempts. Save 5 is after the last round of member 1, 6 after the first of member 2."""
+    kills = {"record:2": "sampler", "save:5": "model", "save:6": "agent", "record:8": "replay_xp"}
+    run = launch(root, "bereaved", local=False, kills=kills)
+    assert sha256s(run) == sha256s(whole)
+    assert run.ledger() == whole.ledger() and run.result["ledger"] == whole.result["ledger"]
+    assert len((run.dir / "attempts.txt").read_text().splitlines()) == 1 + len(kills)
+    rows = [json.loads(line) for line in (run.dir / "run.log").read_text().splitlines()]
+    assert sum(row["event"] == "lost" for row in rows) == len(kills)
+    assert rows[-1]["event"] == "end" and rows[-1]["status"] == "FINISHED"
+
+
+def test_an_evaluation_that_is_done_again_counts_once(whole: Run, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(main_job, "write_run_figures", lambda *given, **named: (_ for _ in ()).throw(Killed()))
+        launch(root, "evaluated")
+    before = Ledger(root / "evaluated" / "ledger.jsonl").table()
+    run = launch(root, "evaluated")
+    assert run.result["ledger"] == before == whole.result["ledger"]
+    assert sha256s(run) == sha256s(whole)
+    assert launch(root, "evaluated").result["ledger"] == before  # and a run that is complete is left as it is
+
+
 def test_a_ring_that_is_full_is_restored_from_a_whole_copy(cluster: None, root: Path) -> None:
     small = ("replay.capacity=1700", "population.size=1")
     unbroken = launch(root, "unbroken_ring", *small)
     with pytest.raises(Killed):
         launch(root, "ring", *small, die_at="save:4")
     names = {path.name for path in (root / "ring" / "checkpoints").iterdir()}
-    assert names == {"progress", "base_000001", "segments_000001", "segments_000002", "segments_000003"}
+    kept = {"progress_000002", "progress_000003", "base_000001"}
+    assert names == kept | {"segments_000001", "segments_000002", "segments_000003"}
     assert sha256s(launch(root, "ring", *small)) == sha256s(unbroken)
 
 
@@ -294,7 +338,7 @@ def test_a_damaged_checkpoint_is_told_in_one_line(whole: Run, root: Path) -> Non
 def test_a_checkpoint_waits_for_its_time(cluster: None, root: Path) -> None:
     with pytest.raises(Killed):
         launch(root, "seldom", "run.checkpoint_seconds=3600", die_at="record:4")
-    state = load_state(root / "seldom" / "checkpoints" / "progress")
+    state = load_state(root / "seldom" / "checkpoints" / "progress_000001")
     assert state["first_member"]["counters"][0] == 0  # that before the rounds
 
 
@@ -339,6 +383,21 @@ def test_rounds_of_a_later_member_end_with_its_steps(root: Path, steps: str, rou
     spec = make_env(config.env.name, 1, **config.env.params).spec
     driver = SimpleNamespace(config=config, spec=spec, members={1: {}})
     assert LaterMember(driver, 2, seed=0).rounds() == rounds  # (2 + 2) episodes of 40 steps each
+
+
+def test_only_a_weak_member_plays_further_rounds(root: Path) -> None:
+    config = smoke(root, "unused", "phase2.rounds=2", "phase2.max_rounds=4", "phase2.target_score=5")
+    driver = SimpleNamespace(config=config, spec=make_env(config.env.name, 1).spec, members={1: {}})
+    member = LaterMember(driver, 2, seed=0)
+    assert member.rounds() == 4
+    for sp, wanted in ((4.9, 4), (5.0, 2)):
+        member.best = SimpleNamespace(sp=sp)
+        played = []
+        for member.number in range(5):
+            if not member._goes_on(member.rounds()):
+                break
+            played.append(member.number)
+        assert len(played) == wanted
 
 
 def test_every_partner_is_met_in_both_seats(root: Path) -> None:
