@@ -18,6 +18,8 @@ def _overcooked(variant: str, num_envs: int, seed: int, params: dict[str, Any]) 
 def _rendezvous(variant: str, num_envs: int, seed: int, params: dict[str, Any]) -> BatchedEnv:
     from popgen.envs.rendezvous import RendezvousEnv
 
+    if variant != "mppmr":  # before the parameters, which may be another environment's
+        raise UserError("env.name", f"unknown environment 'rendezvous/{variant}'", "choose rendezvous/mppmr")
     return RendezvousEnv(variant, num_envs, seed=seed, **params)
 
 

@@ -263,6 +263,12 @@ class RendezvousEnv(BatchedEnv):
         """Time steps (...) int64 of states (..., S)."""
         return np.asarray(states)[..., _TIME].astype(np.int64)
 
+    def positions(self, states: np.ndarray) -> np.ndarray:
+        """Where the players are, (..., P, 2) float64, in any states (..., S)."""
+        states = np.asarray(states)
+        check(states, (*states.shape[:-1], STATE_SIZE), "states")
+        return states[..., :_TIME].reshape(*states.shape[:-1], 2, 4)[..., :2].copy()
+
     def set_time(self, time: np.ndarray) -> None:
         """Overwrite the time steps (B,)."""
         time = np.asarray(time)

@@ -15,7 +15,8 @@ POLICIES: dict[str, str] = {
     "world_model": "popgen.policies.world_model_policy:WorldModelPolicy",
     "random": "popgen.policies.simple:RandomPolicy",
     "idle": "popgen.policies.simple:IdlePolicy",
-    "feed_forward": "popgen.policies.simple:FeedForwardPolicy",
+    "feed_forward": "popgen.policies.feed_forward:FeedForwardPolicy",
+    "encoded": "popgen.policies.encoded:EncodedPolicy",
 }
 """kind -> `module:class`; the only classes that a loaded artefact can name."""
 

@@ -1,18 +1,13 @@
-"""Policies without a world model: uniform-random, idle, and a feed-forward network."""
+"""Policies that learn nothing: uniform-random and idle."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any, ClassVar, Self
 
 import numpy as np
-import torch
-from torch import nn
 
-from popgen.envs.base import EnvSpec, ViewSpec
-from popgen.nets.weights import load_weights, weights_of
-from popgen.shapes import check
+from popgen.envs.base import EnvSpec
 
 
 def _no_weights(weights: Mapping[str, np.ndarray]) -> None:
@@ -106,75 +101,3 @@ class IdlePolicy:
         """See `Policy.from_parts`."""
         _no_weights(weights)
         return cls(spec.action_names, **config)
-
-
-class FeedForwardPolicy:
-    """One multi-layer perceptron for all seats, on the seat's own features and its one-hot number.
-
-    Args:
-        view: the flat view it reads; entries are divided by its scale.
-        num_actions: A.
-        num_players: P.
-        units, layers: of the hidden layers (tanh).
-        greedy: take the likeliest action instead of drawing one.
-        seed: of the initial weights (PyTorch's default initialisation).
-    """
-
-    kind: ClassVar[str] = "feed_forward"
-
-    def __init__(
-        self,
-        view: ViewSpec,
-        num_actions: int,
-        num_players: int = 2,
-        *,
-        units: int = 128,
-        layers: int = 2,
-        greedy: bool = False,
-        seed: int = 0,
-    ) -> None:
-        if len(view.shape) != 1:
-            raise ValueError(f"a feed-forward policy needs a flat view, got shape {view.shape}")
-        self.view = "features"
-        self.units, self.layers, self.greedy = int(units), int(layers), bool(greedy)
-        self._players, self._features, self._scale = num_players, view.shape[0], view.scale
-        sizes = [view.shape[0] + num_players] + [self.units] * self.layers
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            hidden = [part for i, o in pairwise(sizes) for part in (nn.Linear(i, o), nn.Tanh())]
-            self.net = nn.Sequential(*hidden, nn.Linear(sizes[-1], num_actions))
-        self._generator = torch.Generator().manual_seed(0)
-
-    def reset(self, batch: int, seed: int) -> None:
-        """Restart the generator; there is no memory."""
-        self._generator.manual_seed(seed)
-
-    def logits(self, obs: torch.Tensor) -> torch.Tensor:
-        """Action logits (B, P, A) of joint observations (B, P, F)."""
-        seats = torch.eye(self._players).expand(obs.shape[0], -1, -1)
-        return self.net(torch.cat([obs.float() / self._scale, seats], -1))
-
-    @torch.inference_mode()
-    def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
-        """See `Policy.act`; obs is (B, P, F)."""
-        check(obs, (None, self._players, self._features), "obs")
-        logits = self.logits(torch.from_numpy(np.ascontiguousarray(obs)))
-        if self.greedy:
-            return logits.argmax(-1).numpy().astype(np.uint8)
-        drawn = torch.multinomial(logits.flatten(0, 1).softmax(-1), 1, generator=self._generator)
-        return drawn.view(logits.shape[:2]).numpy().astype(np.uint8)
-
-    def config(self) -> dict[str, Any]:
-        """Sizes and the way to pick an action."""
-        return {"units": self.units, "layers": self.layers, "greedy": self.greedy}
-
-    def weights(self) -> dict[str, np.ndarray]:
-        """The network's parameters."""
-        return weights_of(self.net)
-
-    @classmethod
-    def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> Self:
-        """See `Policy.from_parts`."""
-        policy = cls(spec.views["features"], spec.num_actions, spec.num_players, **config)
-        load_weights(policy.net, weights)
-        return policy
