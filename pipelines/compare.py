@@ -1,0 +1,108 @@
+"""The comparison as one call: start what is asked for, read all runs, write the report, log it to MLflow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipelines.batch import run_all
+from popgen.config import RunConfig, TrackingConfig
+from popgen.evaluation.comparison import Group, costs, group_runs, quality_costs
+from popgen.evaluation.comparison_report import Comparison, chosen_thresholds, to_dict, write_report
+from popgen.evaluation.runs import REAL, RunRecord, planned_run, read_run
+from popgen.progress import Reporter
+from popgen.tracking import Tracker
+
+EXPERIMENT = "popgen-compare"
+"""Name of the MLflow experiment that comparisons go to."""
+
+
+def compare_runs(
+    runs: Sequence[tuple[str | None, str | Path]],
+    starts: Sequence[tuple[str | None, RunConfig]],
+    out: str | Path,
+    *,
+    agents: int,
+    sp: float | None,
+    xp: float | None,
+    tracking: TrackingConfig,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Compare finished runs, and runs that are started first.
+
+    Args:
+        runs: (label or None for the method, folder).
+        starts: (label or None, run to start), see `pipelines.batch`; finished ones are not started again.
+        out: folder of the report and, without another URI, of `mlflow.db`.
+        agents: M up to which costs are extrapolated.
+        sp, xp: thresholds of equal quality; None takes the defaults.
+        tracking: of the MLflow runs of this comparison.
+        reporter: told of progress.
+
+    Returns:
+        The object of `popgen.evaluation.comparison_report` and `files` (paths by name).
+
+    Raises:
+        UserError: a run that is unfinished or cannot be compared with the others, or one that fails.
+    """
+    # All that can be refused is, before hours are spent.
+    records = [read_run(path, label) for label, path in runs]
+    planned = [planned_run(config, label) for label, config in starts]
+    chosen_thresholds(group_runs(records + planned), sp, xp)
+    folders = run_all([config for _, config in starts], reporter=reporter)
+    started = [read_run(folder, label) for folder, (label, _) in zip(folders, starts, strict=True)]
+    groups = group_runs(records + started)
+    comparison = Comparison(tuple(groups), agents, chosen_thresholds(groups, sp, xp))
+    files = write_report(comparison, out)
+    log_comparison(comparison, files, Path(out), tracking)
+    return to_dict(comparison) | {"files": {name: str(path) for name, path in files.items()}}
+
+
+def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path, tracking: TrackingConfig) -> None:
+    """An MLflow run for each run compared, with step = number of agents, and one that holds the report."""
+    for group in comparison.groups:
+        for run in group.runs:
+            tracker = Tracker(tracking, out, f"{group.label}/{group.environment}/s{run.seed}", _params(group, run))
+            for agents, figures in points(comparison, group, run).items():
+                tracker.log(figures, step=agents)
+            tracker.finish()
+    tracker = Tracker(tracking, out, "comparison", {"agents": comparison.agents, "runs": len(_runs(comparison))})
+    for path in files.values():
+        tracker.log_artifact(path, "comparison")
+    tracker.finish()
+
+
+def points(comparison: Comparison, group: Group, run: RunRecord) -> dict[int, dict[str, float]]:
+    """Number of agents -> metrics. Extrapolated figures have metrics of their own."""
+    found: dict[int, dict[str, float]] = {}
+    for cost in costs(run, comparison.agents):
+        end = "by_members" if cost.measured else "by_members_extrapolated"
+        figures = {f"environment_steps_{end}": cost.real, f"simulated_steps_{end}": cost.simulated}
+        figures |= {f"{kind}_steps_{end}": cost.steps[str(kind)] for kind in REAL}
+        if cost.seconds is not None:
+            figures[f"seconds_{end}"] = cost.seconds
+        found[cost.agents] = figures
+    limits = comparison.thresholds.get(group.environment)
+    if limits is not None and any(member.curve for member in run.members):
+        for many in quality_costs(run, limits):
+            end = "_lower_bound" if many.bound else ""
+            found[many.agents][f"steps_to_quality_by_members{end}"] = float(many.steps)
+    return found
+
+
+def _params(group: Group, run: RunRecord) -> dict[str, Any]:
+    return {
+        "label": group.label,
+        "method": group.method,
+        "environment": group.environment,
+        "cooking": run.environment.cooking,
+        "seed": run.seed,
+        "scale": run.scale,
+        "run": str(run.path),
+        "members": len(run.members),
+    }
+
+
+def _runs(comparison: Comparison) -> list[RunRecord]:
+    return [run for group in comparison.groups for run in group.runs]

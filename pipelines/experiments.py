@@ -1,0 +1,233 @@
+"""The paper's experiments as calls: self-sabotage on rendezvous (its first table)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.batch import run_all
+from popgen.config import RunConfig
+from popgen.data.ledger import Ledger
+from popgen.errors import UserError
+from popgen.evaluation import sabotage_report
+from popgen.evaluation.paper import METHOD_NAMES
+from popgen.evaluation.plots import path_grid, path_samples
+from popgen.evaluation.sabotage import Paths, SabotageResult, leave_event, measure_sabotage, to_dict
+from popgen.evaluation.sabotage_report import TERMINATIONS, build_report, termination_of
+from popgen.population import Population, load_population
+from popgen.progress import Reporter
+from popgen.types import Kind, LedgerEntry
+
+METHODS = ("lipo", "comedi", "xpm_sim")
+"""Rows of the paper's table."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A finished population and what it is called: a method, or any other name."""
+
+    label: str
+    path: Path
+    population: Population
+
+
+@dataclass(frozen=True)
+class _Measured:
+    source: Source
+    termination: str
+    own: SabotageResult
+    other: Mapping[str, SabotageResult]
+
+    @property
+    def name(self) -> str:
+        return METHOD_NAMES.get(self.source.label, self.source.label)
+
+    @property
+    def file(self) -> str:
+        """Part of the names of its files."""
+        seed = self.source.population.manifest.seed
+        parts = (self.source.label.replace("/", "_"), self.termination, f"s{seed}")
+        return "-".join(part for part in parts if part)
+
+
+def open_sources(named: Sequence[tuple[str, str | Path]]) -> list[Source]:
+    """Load populations, given as their own folders or as those of their runs, and check that they can be measured.
+
+    Raises:
+        UserError: no population, one without members, one of an environment that players cannot leave, environments
+            that differ in more than how an exit is paid, or one population twice.
+    """
+    sources: list[Source] = []
+    for label, path in named:
+        folder = Path(path)
+        inner = folder / "population"
+        population = load_population(inner if (inner / "manifest.json").exists() else folder)
+        leave_event(population.spec)
+        if not len(population):
+            raise UserError(str(path), "has no members yet", "train at least one first")
+        source = Source(label, population.path, population)
+        _check_agrees(sources, source)
+        sources.append(source)
+    return sources
+
+
+def _check_agrees(sources: Sequence[Source], new: Source) -> None:
+    info, seed = new.population.env_info, new.population.manifest.seed
+    for known in sources:
+        if known.path.resolve() == new.path.resolve():
+            raise UserError(str(new.path), "is given twice", "give each population once")
+        there = known.population.env_info
+        if (new.label, info.params, seed) == (known.label, there.params, known.population.manifest.seed):
+            problem = f"is called {new.label} and has seed {seed}, like {known.path}"
+            raise UserError(str(new.path), problem, "give them different names")
+        names = {*info.params, *there.params} - {"exit_penalty", "exit_reward"}
+        different = sorted(name for name in names if info.params.get(name) != there.params.get(name))
+        if info.name != there.name or different:
+            here = f"{different[0]} is {info.params.get(different[0])}" if different else f"is of {info.name}"
+            that = there.params.get(different[0]) if different else there.name
+            raise UserError(str(new.path), f"{here}, {known.path} has {that}", "compare populations of one environment")
+
+
+def self_sabotage(
+    sources: Sequence[tuple[str, str | Path]],
+    starts: Sequence[RunConfig],
+    out: str | Path,
+    *,
+    episodes: int,
+    seed: int,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Train populations or take finished ones, and measure who sabotages whom.
+
+    Args:
+        sources: (method or another name, folder of a population or run).
+        starts: runs to start first, see `pipelines.batch`.
+        out: folder of the report, its figures and `ledger.jsonl`, which counts the evaluation's steps.
+        episodes: per ordered pair of members.
+        seed: of the evaluation.
+        reporter: told of progress.
+
+    Returns:
+        The object of `popgen.evaluation.sabotage_report` and `files` (paths by name).
+
+    Raises:
+        UserError: see `open_sources`; a run that fails; a folder that cannot be written.
+    """
+    open_sources(sources)
+    folders = run_all(starts, reporter=reporter)
+    trained = [(config.method, folder) for config, folder in zip(starts, folders, strict=True)]
+    opened = open_sources([*sources, *trained])
+    if not opened:
+        raise UserError("populations", "there are none to measure", "give --population METHOD=PATH or methods to train")
+    reporter.phase("self-sabotage", len(opened))
+    measured = []
+    for number, source in enumerate(opened, start=1):
+        measured.append(_measure(source, episodes, seed))
+        reporter.update(number, population=source.label)
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        steps = _count(folder, measured)
+        report = build_report(measured[0].own.environment, episodes, seed, steps, [_row(one) for one in measured])
+        files = _write(folder, report) | _draw(folder, measured)
+    except OSError as error:
+        raise UserError(str(folder), f"cannot be written: {error.strerror}", "choose another folder") from error
+    return report | {"files": {name: str(path) for name, path in files.items()}}
+
+
+def _measure(source: Source, episodes: int, seed: int) -> _Measured:
+    """In the environment of its training, and the same play paid by the other rule."""
+    termination = termination_of(source.population.env_info.params)
+    own = measure_sabotage(source.population, episodes, seed)
+    others = {name: rule for name, rule in TERMINATIONS.items() if termination and name != termination}
+    other = {name: measure_sabotage(source.population, episodes, seed, rule) for name, rule in others.items()}
+    return _Measured(source, termination, own, other)
+
+
+def _count(folder: Path, measured: Sequence[_Measured]) -> int:
+    """Enter the evaluation in the experiment's own ledger; every call adds to it. Gives the steps of this call."""
+    ledger = Ledger(folder / "ledger.jsonl")
+    total = 0
+    for one in measured:
+        for rule, result in ((one.termination, one.own), *one.other.items()):
+            sampler = f"self_sabotage.{one.file}.{rule}" if rule else f"self_sabotage.{one.file}"
+            count, size = result.scores.size, result.size
+            entry = LedgerEntry(
+                folder.name,
+                size,
+                Kind.EVALUATION,
+                sampler,
+                len(ledger),
+                result.steps,
+                count,
+                float(result.scores.sum()),
+            )
+            ledger.record(entry)
+            total += result.steps
+    ledger.flush()
+    return total
+
+
+def _row(one: _Measured) -> dict[str, Any]:
+    manifest, members = one.source.population.manifest, one.source.population.members
+    figures = to_dict(one.own)
+    results = {one.termination: one.own, **one.other} if one.termination else {}
+    paid = {rule: to_dict(result) for rule, result in results.items()}
+    kinds = sorted({kind for member in members for kind in member.steps})
+    return {
+        "method": manifest.method,
+        "name": one.name,
+        "termination": one.termination,
+        "training_seed": manifest.seed,
+        "population": str(one.source.path),
+        "training_steps": {kind: sum(member.steps.get(kind, 0) for member in members) for kind in kinds},
+        **{name: figures[name] for name in ("members", "self_sabotage", "average", "ended_early")},
+        **{name: figures[name] for name in ("average_ended_early", "sp", "xp", "landmarks", "matrix", "exits")},
+        "scored": {rule: {"sp": told["sp"], "xp": told["xp"]} for rule, told in paid.items()},
+    }
+
+
+def _write(folder: Path, report: Mapping[str, Any]) -> dict[str, Path]:
+    texts = {
+        "self_sabotage.json": sabotage_report.to_json(report),
+        "self_sabotage.csv": sabotage_report.to_csv(report),
+        "self_sabotage.md": sabotage_report.to_markdown(report),
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return {name: folder / name for name in texts}
+
+
+def _draw(folder: Path, measured: Sequence[_Measured]) -> dict[str, Path]:
+    """All pairs of each population, and for each rule of termination one pair of each population side by side."""
+    found: dict[str, Path] = {}
+
+    def two(name: str) -> list[Path]:
+        paths = {f"{name}.{suffix}": folder / f"{name}.{suffix}" for suffix in ("png", "svg")}
+        found.update(paths)
+        return [*paths.values()]
+
+    samples: dict[str, list[tuple[str, Paths, tuple[int, int]]]] = {}
+    for one in measured:
+        if one.own.paths is None:
+            continue
+        title = f"{one.name}, seed {one.source.population.manifest.seed}: one episode of each pair"
+        path_grid(one.own.paths, two(f"paths-{one.file}"), title=title)
+        if one.own.size > 1:
+            pair = sample_pair(one.own)
+            told = f"{one.name}, seed {one.source.population.manifest.seed}\nagents {pair[0]} and {pair[1]}"
+            samples.setdefault(one.termination, []).append((told, one.own.paths, pair))
+    for termination, chosen in samples.items():
+        path_samples(chosen, two(f"paths-samples-{termination}" if termination else "paths-samples"))
+    return found
+
+
+def sample_pair(result: SabotageResult) -> tuple[int, int]:
+    """Members in seat 0 and 1 of the cross-play episode to show: the pair in which most leave, the last one if none."""
+    size = result.size
+    pairs = [(i, j) for i in range(size) for j in range(i)]
+    shown = {pair: result.paths.left[pair].any() if result.paths else False for pair in pairs}
+    worst = max(pairs, key=lambda pair: (result.exits[pair].any(axis=-1).mean(), shown[pair], pair))
+    return worst[0] + 1, worst[1] + 1

@@ -1,0 +1,284 @@
+"""Self-sabotage: how often an agent ends cross-play by leaving the task, instead of holding to another convention.
+
+The measure of the paper's section "Empirical Analysis of Self-Sabotage Behavior" and its table "Results of the MPPMR
+environment". It needs an environment with an event that says which player left.
+
+For agent m and each earlier agent k < m, both seatings are played. The paper counts every episode that ended early,
+whoever ended it (`ended_early` here). An agent cannot help what its partner does, so the headline figure
+(`self_sabotage`) counts only the episodes in which agent m itself left; where both leave in the same step, both count.
+Agent 1 has no earlier agents; as in the paper it stands as 0 and counts in the average.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from popgen.envs.base import BatchedEnv, EnvSpec
+from popgen.envs.registry import make_env
+from popgen.errors import UserError
+from popgen.evaluation.crossplay import Estimate
+from popgen.evaluation.rollout import Episodes, Transition, play
+from popgen.policies.base import Policy
+from popgen.population.store import Population
+
+LEAVES = "leaves"
+"""How the name of an event begins by which a player leaves the task."""
+
+
+@runtime_checkable
+class Plane(Protocol):
+    """An environment whose players move on a plane with a boundary and landmarks."""
+
+    bounds: float
+    landmarks: np.ndarray
+
+    def positions(self, states: np.ndarray) -> np.ndarray:
+        """Where the players are, (..., P, 2), in states (..., S)."""
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Where the players went, one episode of each ordered pair of M members.
+
+    Attributes:
+        positions: (M, M, T + 1, P, 2), NaN after the end of an episode; row = member in seat 0.
+        left: (M, M, P) bool, who left the bounds.
+        bounds: half side of the square.
+        landmarks: (K, 2).
+    """
+
+    positions: np.ndarray
+    left: np.ndarray
+    bounds: float
+    landmarks: np.ndarray
+
+
+@dataclass(frozen=True)
+class SabotageResult:
+    """What M members do to each other.
+
+    Attributes:
+        environment, params: that it was played in.
+        event: by which players leave.
+        episodes: N, per ordered pair.
+        seed: of the evaluation.
+        steps: environment steps taken, kind `evaluation`.
+        exits: (M, M, N, P) bool, who left; [i, j] is member i + 1 in seat 0 with member j + 1 in seat 1.
+        ended: (M, M, N) bool, the episode ended before the horizon.
+        scores: (M, M, N), the episodes' scores.
+        landmarks: (M, K) how many self-play episodes of a member ended at each landmark; None without landmarks.
+        paths: None where players do not move on a plane.
+    """
+
+    environment: str
+    params: Mapping[str, Any]
+    event: str
+    episodes: int
+    seed: int
+    steps: int
+    exits: np.ndarray
+    ended: np.ndarray
+    scores: np.ndarray
+    landmarks: np.ndarray | None
+    paths: Paths | None
+
+    @property
+    def size(self) -> int:
+        """M."""
+        return len(self.exits)
+
+    def self_sabotage(self, member: int) -> float:
+        """Fraction of the episodes with earlier members in which `member` (from 1) itself left; 0 for member 1."""
+        own, earlier = member - 1, range(member - 1)
+        parts = [self.exits[own, k, :, 0] for k in earlier] + [self.exits[k, own, :, 1] for k in earlier]
+        return float(np.mean(parts)) if parts else 0.0
+
+    def ended_early(self, member: int) -> float:
+        """Fraction of the episodes with earlier members that ended early, whoever ended them: the paper's reading."""
+        own, earlier = member - 1, range(member - 1)
+        parts = [self.ended[own, k] for k in earlier] + [self.ended[k, own] for k in earlier]
+        return float(np.mean(parts)) if parts else 0.0
+
+    @property
+    def average(self) -> float:
+        """Mean self-sabotage over all members, the first included."""
+        return float(np.mean([self.self_sabotage(m + 1) for m in range(self.size)]))
+
+    @property
+    def average_ended_early(self) -> float:
+        """Mean of `ended_early` over all members, the first included."""
+        return float(np.mean([self.ended_early(m + 1) for m in range(self.size)]))
+
+    @property
+    def sp(self) -> Estimate:
+        """Mean self-play score over members."""
+        return Estimate.average([Estimate.of(self.scores[m, m]) for m in range(self.size)])
+
+    @property
+    def xp(self) -> Estimate:
+        """Mean cross-play score over ordered pairs of different members; NaN for one member."""
+        pairs = [(i, j) for i in range(self.size) for j in range(self.size) if i != j]
+        return Estimate.average([Estimate.of(self.scores[pair]) for pair in pairs])
+
+    def landmark(self, member: int) -> int | None:
+        """Landmark (from 1) at which more than half of a member's self-play ends; None where there is none."""
+        if self.landmarks is None:
+            return None
+        counts = self.landmarks[member - 1]
+        best = int(np.argmax(counts))
+        return best + 1 if counts[best] > self.episodes / 2 else None
+
+    @property
+    def used(self) -> list[int]:
+        """Landmarks that at least one member uses."""
+        found = {self.landmark(member + 1) for member in range(self.size)}
+        return sorted(landmark for landmark in found if landmark is not None)
+
+
+def leave_event(spec: EnvSpec) -> str:
+    """Name of the event by which a player leaves the task.
+
+    Raises:
+        UserError: the environment has none, or several.
+    """
+    found = [name for name in spec.event_names if name.startswith(LEAVES)]
+    if len(found) != 1:
+        have = ", ".join(spec.event_names)
+        problem = f"{spec.name} has {'several events' if found else 'no event'} by which a player leaves ({have})"
+        raise UserError("env.name", problem, "choose an environment like rendezvous/mppmr")
+    return found[0]
+
+
+def measure_sabotage(
+    population: Population, episodes: int, seed: int, params: Mapping[str, Any] | None = None
+) -> SabotageResult:
+    """Play every ordered pair of members and see who leaves.
+
+    Args:
+        population: of at least one member.
+        episodes: N, per ordered pair.
+        seed: same arguments, same result.
+        params: parameters of the environment that are to differ from those the members were trained with, such as
+            the rule by which an exit is paid. The same seed gives the same actions as long as observations are equal.
+
+    Raises:
+        UserError: no members, less than one episode, or an environment without an event of leaving.
+    """
+    if not len(population):
+        raise UserError(str(population.path), "has no members yet", "train at least one first")
+    if episodes < 1:
+        raise UserError("episodes", f"must be at least 1, got {episodes}")
+    info, count = population.env_info, len(population)
+    teams = np.array([(i, j) for i in range(count) for j in range(count)])
+    env = make_env(info.name, len(teams) * episodes, seed=0, **{**info.params, **(params or {})})
+    event = env.spec.event_names.index(leave_event(env.spec))
+    policies: list[Policy] = [population[member + 1] for member in range(count)]
+    recorder = _Recorder(env)
+    played = play(env, policies, np.repeat(teams, episodes, axis=0), seed=seed, record=recorder)
+    shape = (count, count, episodes)
+    exits = (played.events[..., event] > 0).reshape(*shape, -1)
+    return SabotageResult(
+        environment=info.name,
+        params=dict(env.spec.params),
+        event=env.spec.event_names[event],
+        episodes=episodes,
+        seed=seed,
+        steps=played.steps,
+        exits=exits,
+        ended=played.terminated.reshape(shape),
+        scores=played.score.reshape(shape),
+        landmarks=_landmarks(env, recorder, played, shape),
+        paths=_paths(env, recorder, exits, shape),
+    )
+
+
+class _Recorder:
+    """Keeps the positions of all rows, step by step."""
+
+    def __init__(self, env: BatchedEnv) -> None:
+        self.env = env if isinstance(env, Plane) else None
+        self.positions: list[np.ndarray] = []
+
+    def __call__(self, step: Transition) -> None:
+        if self.env is None:
+            return
+        if not self.positions:
+            self.positions.append(self.env.positions(step.states))
+        here = self.env.positions(step.next_states)
+        self.positions.append(np.where(step.counted[:, None, None], here, np.nan))
+
+    def all(self) -> np.ndarray:
+        """(B, T + 1, P, 2), NaN after the end of an episode."""
+        return np.stack(self.positions, axis=1)
+
+
+def _landmarks(
+    env: BatchedEnv, recorder: _Recorder, played: Episodes, shape: tuple[int, int, int]
+) -> np.ndarray | None:
+    """(M, K): self-play episodes that ran to the horizon and ended with both players' centre at a landmark.
+
+    At a landmark is nearer than a quarter of the least distance between two of them, so that no place belongs to two.
+    """
+    if not isinstance(env, Plane) or len(env.landmarks) < 2:
+        return None
+    rows = np.arange(len(played.length))
+    last = recorder.all()[rows, played.length].mean(axis=1)  # (B, 2)
+    between = np.linalg.norm(env.landmarks[:, None] - env.landmarks[None], axis=-1)
+    reach = between[~np.eye(len(between), dtype=bool)].min() / 4
+    near = np.linalg.norm(last[:, None] - env.landmarks[None], axis=-1) < reach  # (B, K)
+    near &= ~played.terminated[:, None]
+    members = np.arange(shape[0])
+    return near.reshape(*shape, -1)[members, members].sum(axis=1)
+
+
+def _paths(env: BatchedEnv, recorder: _Recorder, exits: np.ndarray, shape: tuple[int, int, int]) -> Paths | None:
+    """The first episode of each pair."""
+    if not isinstance(env, Plane):
+        return None
+    positions = recorder.all()
+    first = positions.reshape(*shape, *positions.shape[1:])[:, :, 0]
+    return Paths(first, exits[:, :, 0], float(env.bounds), np.asarray(env.landmarks))
+
+
+def to_dict(result: SabotageResult) -> dict[str, Any]:
+    """The JSON-able figures; null stands for what is unknown."""
+    members = range(1, result.size + 1)
+    return {
+        "environment": {"name": result.environment, "params": dict(result.params)},
+        "event": result.event,
+        "episodes": result.episodes,
+        "seed": result.seed,
+        "steps": {"evaluation": result.steps},
+        "members": list(members),
+        "self_sabotage": [result.self_sabotage(m) for m in members],
+        "average": result.average,
+        "ended_early": [result.ended_early(m) for m in members],
+        "average_ended_early": result.average_ended_early,
+        "sp": _figure(result.sp),
+        "xp": _figure(result.xp),
+        "matrix": result.scores.mean(axis=-1).tolist(),
+        "exits": result.exits.mean(axis=2).tolist(),
+        "landmarks": _landmark_figures(result),
+    }
+
+
+def _landmark_figures(result: SabotageResult) -> dict[str, Any] | None:
+    if result.landmarks is None:
+        return None
+    members = [result.landmark(m) for m in range(1, result.size + 1)]
+    return {
+        "used": result.used,
+        "of": result.landmarks.shape[1],
+        "members": members,
+        "counts": result.landmarks.tolist(),
+    }
+
+
+def _figure(estimate: Estimate) -> dict[str, float | None]:
+    values = {"mean": estimate.mean, "standard_error": estimate.error}
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
