@@ -1,0 +1,268 @@
+"""XPM-Sim with the exact simulator as dynamics model F (paper, section 3): member after member, few real episodes."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ray
+
+from actors.common import options
+from actors.exact_learner import ExactLearnerActor, Learned
+from actors.sampler import PolicyParts, SamplerActor
+from pipelines.books import Books
+from pipelines.checkpoints import Checkpoints, fitting, member_folder
+from pipelines.play import Players
+from popgen.algos.xpm_sim.learner import make_actor
+from popgen.algos.xpm_wm.partners import PartnerReturns
+from popgen.config import RunConfig
+from popgen.data.checkpoint import load_state, save_state
+from popgen.data.sampler import Episode, Team
+from popgen.envs.base import EnvSpec
+from popgen.envs.reward import rewards_events
+from popgen.errors import UserError
+from popgen.nets.weights import Weights, prefixed
+from popgen.population import load_population
+from popgen.progress import Reporter
+from popgen.types import Kind, Segment
+
+
+@dataclass
+class Crew:
+    """The actors of one run: samplers of real episodes, and the learner with its buffers and simulator."""
+
+    players: Players
+    learner: Any
+
+    @staticmethod
+    def hire(config: RunConfig, attempt: str) -> Crew:
+        """Create all actors; sampler names carry the run and its attempt."""
+        cluster = config.cluster
+        sampler = ray.remote(SamplerActor).options(**options(cluster, cluster.sampler_cpus))
+        learner = ray.remote(ExactLearnerActor).options(**options(cluster, cluster.agent_cpus))
+        names = [f"sampler{index}.{attempt}" for index in range(cluster.samplers)]
+        samplers = [sampler.remote(config.env, name, cluster.threads) for name in names]
+        return Crew(Players(samplers), learner.remote(config, cluster.threads))
+
+    def dismiss(self) -> None:
+        """End all actors."""
+        for actor in (*self.players.samplers, self.learner):
+            ray.kill(actor)
+
+
+class XpmSim:
+    """The driver: real episodes of the present policy, then simulated updates, in turn."""
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> None:
+        self.config, self.spec, self.books, self.reporter = config, spec, books, reporter
+        self.crew = Crew.hire(config, f"{books.run_id}.{books.attempt}")
+        self.checkpoints = Checkpoints(books.dir, long=1, seconds=config.run.checkpoint_seconds)
+        actor = make_actor(config.xpm_sim, spec)
+        self.kind, self.sizes = actor.kind, actor.config()
+        self.members: dict[int, Weights] = {}
+        self.encoder: dict[str, Any] | None = None
+
+    def run(self) -> None:
+        """Train every member that is not there yet."""
+        try:
+            known, saved = self._resume()
+            for member in range(known + 1, self.config.population.size + 1):
+                began = time.time()
+                if saved is None:
+                    self.checkpoints.begin(None)
+                trainer = Member(self, member)
+                trainer.train(saved)
+                self._complete(trainer, time.time() - began)
+                saved = None
+        finally:
+            self.crew.dismiss()
+
+    def parts(self, weights: Weights) -> PolicyParts:
+        """A member's policy as it travels to a sampler."""
+        return PolicyParts(self.kind, self.sizes, weights)
+
+    def _complete(self, trainer: Member, seconds: float) -> None:
+        """Add the member to the population and enter it in the books."""
+        member, books = trainer.member, self.books
+        figures, steps = ray.get(self.crew.learner.check.remote())
+        books.record_steps(member, Kind.SIMULATED, f"check.{books.attempt}", 0, steps, 0)
+        critics = prefixed("critics", ray.get(self.crew.learner.critics.remote()))
+        trainer.log({f"check/{name}": value for name, value in figures.items()})
+        self.encoder = ray.get(self.crew.learner.encoder.remote())
+        save_state(member_folder(books.dir, member), {"ledger": len(books.ledger), "encoder": self.encoder})
+        policy = make_actor(self.config.xpm_sim, self.spec)
+        policy.load(trainer.acting)
+        extra = {
+            **{name: trainer.figures[name] for name in ("sp", "xp") if name in trainer.figures},
+            "seconds": round(seconds, 1),
+            "simulated_steps": books.ledger.steps(member=member, kind=Kind.SIMULATED),
+            "check": figures,
+        }
+        books.add_member(policy, critics, seed=trainer.seed, extra=extra)
+        self.members[member] = trainer.acting
+        self.reporter.note(
+            f"member {member}: SP {trainer.figures['sp']:.2f}, strongest XP {trainer.figures.get('xp', math.nan):.2f} "
+            f"{self.spec.score_name} in training, from XP states {figures.get('restart_ratio', math.nan):.2f} of SP, "
+            f"{trainer.steps:,} real and {extra['simulated_steps']:,} simulated steps, {seconds / 60:.1f} min"
+        )
+
+    def _resume(self) -> tuple[int, dict[str, Any] | None]:
+        """Finished members of this run, and the running one's last checkpoint; work behind neither is done again."""
+        known = len(self.books.population)
+        saved = self.checkpoints.load(known + 1)
+        last = load_state(member_folder(self.books.dir, known)) if known else {"ledger": 0, "encoder": None}
+        self.encoder = last["encoder"]
+        held, wanted = len(self.books.ledger), (saved or last)["ledger"]
+        if wanted > held:
+            problem = f"has {held} entries, the checkpoint knows {wanted}"
+            raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
+        if self.checkpoints.note:
+            self.reporter.note(self.checkpoints.note)
+        if lost := self.books.ledger.cut(wanted):
+            self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
+        if known:
+            population = load_population(self.books.dir / "population")
+            self.members = {member: population[member].weights() for member in range(1, known + 1)}
+        return known, saved
+
+
+class Member:
+    """The rounds of one member: what it plays, learns and enters in the books."""
+
+    def __init__(self, driver: XpmSim, member: int) -> None:
+        self.driver, self.member, self.seed = driver, member, driver.config.run.seed * 1000 + member
+        self.config = driver.config.xpm_sim
+        self.partners = sorted(driver.members)
+        # Both seatings of all partners, in an order of this member's own; rounds take them in turn.
+        order = np.random.default_rng(self.seed).permutation(self.partners)
+        self.pairs = [pair for k in order.tolist() for pair in ((member, k), (k, member))]
+        self.returns = PartnerReturns(self.config.partner)
+        self.figures: dict[str, float] = {}
+        self.round = self.updates = self.steps = 0
+        self.acting: Weights = {}
+
+    def train(self, saved: dict[str, Any] | None) -> None:
+        """All rounds; `saved` is a checkpoint to go on from, made after a round."""
+        driver, learner = self.driver, self.driver.crew.learner
+        self.acting = ray.get(learner.begin_member.remote(self.member, self.seed, driver.members, driver.encoder))
+        driver.reporter.phase(f"member {self.member}: simulated self-play and cross-play", self.config.updates)
+        if saved is not None:
+            with fitting(driver.checkpoints.folder):
+                ray.get(learner.load_state.remote(saved["learner"]))
+                self._restore(saved["progress"])
+        while self.updates < self.config.updates:
+            learned = self._round(min(self.config.updates_per_round, self.config.updates - self.updates))
+            self._enter(learned)
+            self.round += 1
+            if driver.checkpoints.due() and self.updates < self.config.updates:
+                self._save()
+
+    def _round(self, updates: int) -> Learned:
+        """Real episodes and updates: one after the other, or with schedule=async at the same time, the episodes then
+        being those of the policy before the updates and the starts one round older."""
+        learner, together = self.driver.crew.learner, self.driver.config.run.schedule == "async" and self.round > 0
+        running = learner.train.remote(updates) if together else None
+        self._play()
+        learned: Learned = ray.get(running or learner.train.remote(updates))
+        self.acting, self.updates = learned.acting, self.updates + updates
+        return learned
+
+    # ---- real episodes -------------------------------------------------------------------------------------------
+
+    def _teams(self) -> list[Team]:
+        """Self-play, and cross-play with as many pairs as there are episodes, in turn."""
+        teams = [Team(Kind.SP, (self.member, self.member), self.config.episodes_sp)]
+        if not self.pairs:
+            return teams
+        count, episodes = min(len(self.pairs), self.config.episodes_xp), self.config.episodes_xp
+        chosen = [self.pairs[(self.round * count + i) % len(self.pairs)] for i in range(count)]
+        return teams + [
+            Team(Kind.XP, pair, episodes // count + (i < episodes % count)) for i, pair in enumerate(chosen)
+        ]
+
+    def _play(self) -> None:
+        """One episode in each environment; its states go into the buffers, its steps into the ledger."""
+        driver, crew, seed = self.driver, self.driver.crew, self.seed * 1000 + self.round
+        teams = self._teams()
+        weights = {**driver.members, self.member: self.acting}
+        crew.players.open(teams, {member: driver.parts(own) for member, own in weights.items()}, seed)
+        episodes: list[Episode] = []
+        segments: list[Segment] = []
+        for reference, collected in crew.players.collect(driver.spec.horizon):
+            driver.books.record(self.member, collected)
+            self.steps += sum(steps for *_, steps in collected.counts)
+            episodes += collected.episodes
+            segments += ray.get(reference)
+        self._judge(episodes)
+        added = crew.learner.add.remote(segments, self.returns.scores())
+        if driver.config.run.schedule == "sync":  # else it waits in the learner's queue
+            ray.get(added)
+
+    def _judge(self, episodes: list[Episode]) -> None:
+        """Self-play's mean score, each partner's latest cross-play return, and the strongest partner's."""
+        events = rewards_events(self.driver.spec)
+        self.figures["sp"] = float(np.mean([e.score for e in episodes if e.kind is Kind.SP]))
+        for partner in self.partners:
+            found = [e for e in episodes if e.kind is Kind.XP and partner in e.members]
+            self.returns.add(partner, [e.shaped if events else e.score for e in found])
+            if found:
+                self.figures[f"xp/{partner}"] = float(np.mean([e.score for e in found]))
+        if known := [value for name, value in self.figures.items() if name.startswith("xp/")]:
+            self.figures["xp"] = max(known)
+
+    # ---- books ---------------------------------------------------------------------------------------------------
+
+    def _enter(self, learned: Learned) -> None:
+        driver, books, real = self.driver, self.driver.books, self._real()
+        books.record_steps(
+            self.member, Kind.SIMULATED, f"simulator.{books.attempt}", self.round, learned.steps, learned.trajectories
+        )
+        self.log({f"learner/{name}": value for name, value in learned.metrics.items()} | real)
+        name = driver.spec.score_name
+        told = {name: round(self.figures["sp"], 2), **({"XP": round(self.figures["xp"], 2)} if self.pairs else {})}
+        driver.reporter.update(self.updates, steps=self.steps, **told)
+
+    def _real(self) -> dict[str, float]:
+        """Figures of the round's real episodes, and what the policy that played them had been trained with."""
+        simulated = self.driver.books.ledger.steps(member=self.member, kind=Kind.SIMULATED)
+        return {f"real_{k}": v for k, v in self.figures.items()} | {
+            "updates": float(self.updates),
+            "simulated_steps": float(simulated),
+        }
+
+    def log(self, figures: dict[str, float]) -> None:
+        """A point of metrics at the member's real steps.
+
+        Raises:
+            FloatingPointError: a learner's figure is not finite: it will not recover.
+        """
+        self.driver.books.log(self.member, self.steps, **figures)
+        for name, value in figures.items():
+            if name.startswith("learner/") and not math.isfinite(value):
+                raise FloatingPointError(f"{name} of member {self.member} is {value} after {self.updates:,} updates")
+
+    # ---- checkpoints ---------------------------------------------------------------------------------------------
+
+    def _save(self) -> None:
+        driver = self.driver
+        progress = {
+            "counters": [self.round, self.updates, self.steps],
+            "figures": dict(self.figures),
+            "returns": self.returns.state(),
+            "acting": self.acting,
+            "samplers": driver.crew.players.state(),
+        }
+        state = {"learner": ray.get(driver.crew.learner.state.remote()), "progress": progress}
+        driver.checkpoints.save(self.member, {**state, "ledger": len(driver.books.ledger)}, dict)
+        driver.books.checkpointed(self.member, self.round)
+
+    def _restore(self, progress: dict[str, Any]) -> None:
+        self.round, self.updates, self.steps = progress["counters"]
+        self.figures, self.acting = dict(progress["figures"]), progress["acting"]
+        self.returns.load_state(progress["returns"])
+        # Fresh samplers have played nothing; only the running number of their segments matters.
+        self.driver.crew.players.load_state(progress["samplers"])
+        self.driver.reporter.note(f"going on after {self.updates} updates of member {self.member}")
