@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 export RAY_USAGE_STATS_ENABLED := 0
 export MLFLOW_DISABLE_TELEMETRY := true
 
-.PHONY: demo test lint format oracle bench install clean
+.PHONY: chaos demo test lint format oracle bench install clean
 
 demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 	$(BIN)/popgen run env=overcooked/cramped_room scale=demo seed=1
@@ -27,6 +27,9 @@ oracle: install  ## every layout and cooking mode against overcooked_ai, 20,000 
 
 bench: install
 	$(BIN)/popgen bench env --json
+
+chaos: install  ## random faults on small runs: each must end as if nothing had happened
+	$(BIN)/python tests/chaos/campaign.py
 
 install: $(STAMP)
 

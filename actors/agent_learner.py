@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from actors.common import build_env, settle
+from actors.common import build_env, device_of, settle
 from popgen.algos.xpm_wm.agent_learner import AgentLearner
 from popgen.algos.xpm_wm.starts import Starts
 from popgen.config import RunConfig
@@ -26,7 +26,8 @@ class AgentActor:
 
     def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
         """A fresh actor and critics beside frozen predecessors (actor weights by member)."""
-        self.learner = AgentLearner(self.config.agent, self.config.world_model, self.spec, member, seed)
+        config, device = self.config, device_of(self.config.cluster.agent_gpus)
+        self.learner = AgentLearner(config.agent, config.world_model, self.spec, member, seed, device)
         for partner, weights in partners.items():
             self.learner.add_partner(partner, weights)
 
@@ -38,7 +39,7 @@ class AgentActor:
         self, updates: int, model: Weights, starts: Starts, new_share: float, partner_scores: dict[int, float]
     ) -> tuple[Weights, Weights, dict[str, float]]:
         """Imagine and update `updates` times; acting weights (filter and actor), critics and mean metrics."""
-        began = time.perf_counter()
+        began, began_cpu = time.perf_counter(), time.process_time()
         self.learner.set_model(model)
         self.learner.set_starts(starts, new_share)
         self.learner.partner_scores = dict(partner_scores)
@@ -48,6 +49,8 @@ class AgentActor:
                 totals[name].append(value)
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["seconds"] = time.perf_counter() - began
+        means["cpu_seconds"] = time.process_time() - began_cpu
+        means["update_ms"] = 1000.0 * means["seconds"] / updates
         return self.acting_weights(model), weights_of(self.learner.critics), means
 
     def acting_weights(self, model: Weights) -> Weights:

@@ -7,6 +7,7 @@ from typing import Any
 
 from popgen.config import ClusterConfig, EnvConfig
 from popgen.envs import BatchedEnv, make_env
+from popgen.errors import UserError
 
 
 def settle(threads: int) -> None:
@@ -15,6 +16,22 @@ def settle(threads: int) -> None:
 
     torch.set_num_threads(threads)
     os.environ["OMP_NUM_THREADS"] = str(threads)
+
+
+def device_of(gpus: float) -> str:
+    """Where a learner's tensors are: "cuda", which Ray makes the card that it assigned, if it asks for `gpus`.
+
+    Raises:
+        UserError: this node's torch has no use for the card.
+    """
+    import torch
+
+    if gpus <= 0.0:
+        return "cpu"
+    if not torch.cuda.is_available():
+        problem = "Ray assigned a GPU, but torch sees none on that node"
+        raise UserError("cluster", problem, "install a CUDA build of torch, or set model_gpus and agent_gpus to 0")
+    return "cuda"
 
 
 def build_env(config: EnvConfig, num_envs: int, seed: int = 0) -> BatchedEnv:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from actors.common import build_env, settle
+from actors.common import build_env, device_of, settle
 from popgen.algos.xpm_wm.diagnostics import OPEN_LOOP, model_report
 from popgen.algos.xpm_wm.model_learner import ModelLearner
 from popgen.algos.xpm_wm.recipe import Draws, model_batch, start_batch
@@ -30,7 +30,7 @@ class ModelActor:
         settle(threads)
         self.config = config
         self.spec = build_env(config.env, 1).spec
-        self.learner = ModelLearner(config.world_model, self.spec, seed)
+        self.learner = ModelLearner(config.world_model, self.spec, seed, device_of(config.cluster.model_gpus))
         self.member = 1
         self.biased = False
 
@@ -57,7 +57,7 @@ class ModelActor:
 
     def train(self, updates: int, starts_per_update: int) -> tuple[Weights, Starts | None, dict[str, float]]:
         """`updates` gradient steps; weights, start states from the training windows, mean metrics."""
-        began = time.perf_counter()
+        began, began_cpu = time.perf_counter(), time.process_time()
         config, learner = self.config.world_model, self.learner
         totals: dict[str, list[float]] = defaultdict(list)
         starts: list[Starts] = []
@@ -75,6 +75,8 @@ class ModelActor:
                     starts.append(learner.starts(seen, windows, starts_per_update, pool=OLD))
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["seconds"] = time.perf_counter() - began
+        means["cpu_seconds"] = time.process_time() - began_cpu
+        means["update_ms"] = 1000.0 * means["seconds"] / max(1, updates)
         return weights_of(learner.model), Starts.concat(starts) if starts else None, means
 
     def cache_starts(self) -> Starts:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
+
+import ray
 
 from actors.common import build_env, settle
 from popgen.config import EnvConfig
@@ -26,12 +29,13 @@ class PolicyParts:
 class Collected:
     """What the ledger and the driver need of a round of sampling, beside the segments themselves.
 
-    counts: (kind, members, sequence, steps) per segment; episodes: those that ended.
+    counts: (kind, members, sequence, steps) per segment; episodes: those that ended; cpu_seconds: of the sampler.
     """
 
     sampler: str
     counts: list[tuple[Kind, tuple[int, int], int, int]]
     episodes: list[Episode]
+    cpu_seconds: float = 0.0
 
 
 class SamplerActor:
@@ -43,8 +47,10 @@ class SamplerActor:
         self.sequence = 0
         self.sampler: Sampler | None = None
 
-    def open(self, teams: list[Team], parts: dict[int, PolicyParts], seed: int, stagger: bool) -> None:
-        """Start fresh episodes of the given teams; `parts` holds a policy for every member in them."""
+    def open(self, teams: list[Team], parts: dict[int, Any], seed: int, stagger: bool) -> None:
+        """Start fresh episodes of the given teams; `parts` holds `PolicyParts`, or a reference to them, for every
+        member in them. All samplers of a node read one copy of what is referred to."""
+        parts = {m: ray.get(p) if isinstance(p, ray.ObjectRef) else p for m, p in parts.items()}
         env = build_env(self.env_config, sum(team.envs for team in teams), seed)
         policies = {member: build_policy(p.kind, p.config, p.weights, env.spec) for member, p in parts.items()}
         self.sampler = Sampler(env, teams, policies, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence)
@@ -55,12 +61,13 @@ class SamplerActor:
         """Play `steps` joint steps, with new weights for one member if given; segments and their counts."""
         if self.sampler is None:
             raise RuntimeError("open before collect")
+        began = time.process_time()
         if member is not None and weights is not None:
             self.sampler.policies[member].load(weights)
         segments, episodes = self.sampler.collect(steps)
         self.sequence = self.sampler.sequence
         counts = [(s.kind, s.members, s.sequence, s.steps) for s in segments]
-        return segments, Collected(self.name, counts, episodes)
+        return segments, Collected(self.name, counts, episodes, time.process_time() - began)
 
     def state(self) -> dict[str, Any]:
         """The running episodes and the number of the next segment."""

@@ -14,10 +14,14 @@ import numpy as np
 
 from actors.sampler import Collected
 from actors.tracker import RemoteTracker
+from pipelines.runs import RunState
+from pipelines.watch import DiskWatch, RunLog, gauge, show_figures
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
+from popgen.data.storage import Mirror
 from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
+from popgen.jsonable import unique
 from popgen.nets.weights import Weights
 from popgen.policies.base import Policy
 from popgen.population import PopulationWriter, load_population
@@ -26,16 +30,27 @@ from popgen.types import Kind, LedgerEntry
 
 
 class Books:
-    """One run's records. Everything is on disk when `close` returns, and enough of it to go on before that."""
+    """One run's records. Everything is on disk when `close` returns, and enough of it to go on before that.
 
-    def __init__(self, config: RunConfig, spec: EnvSpec) -> None:
+    Opened again on the same folder, they go on: after the death of a driver, or of an actor, from the disk alone.
+
+    Args:
+        config: of the run; without `run.id` it gets one.
+        spec: of its environment.
+        tracker: that of the books of an earlier attempt of this process.
+
+    Raises:
+        UserError: another process is at this run, it has another config, or a file of it is damaged.
+    """
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, tracker: RemoteTracker | None = None) -> None:
+        config = named(config)
         self.config, self.spec = config, spec
-        stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
-        variant = Path(config.env.name).stem
-        self.run_id = config.run.id or f"{config.method}-{variant}-s{config.run.seed}-{stamp}"
-        self.dir = Path(config.run.root) / self.run_id
+        self.run_id = str(config.run.id)
+        self.dir = run_folder(config)
         self.dir.mkdir(parents=True, exist_ok=True)
         self.began = time.time()
+        self.state = RunState(self.dir)
         self._check_same_config()
         self.attempt = self._next_attempt()
         self._mend_metrics()
@@ -49,14 +64,20 @@ class Books:
             resume=True,
         )
         params = config.relevant()
-        self.tracker = RemoteTracker(config.tracking, self.dir, self.run_id, params, self._resumed())
+        self.tracker = tracker or RemoteTracker(config.tracking, self.dir, self.run_id, params, self._resumed())
+        self.events = RunLog(self.dir, self.run_id, self.attempt)
+        self.disk = DiskWatch(self.dir, config.run.disk_reserve)
+        self.mirror = Mirror(self.dir, config.run.storage) if config.run.storage else None
+        self.iterations: Counter[int] = Counter()
+        self.state.start(self.attempt)
+        self.events.write("start", method=config.method, environment=config.env.name)
 
     def _check_same_config(self) -> None:
         path = self.dir / "config.json"
-        if path.exists():
+        if path.exists() or path.is_symlink():
             try:
-                known = RunConfig.parse(json.loads(path.read_text()))
-            except ValueError as error:  # damaged, or of a version with other fields
+                known = RunConfig.parse(json.loads(path.read_text(), object_pairs_hook=unique))
+            except (OSError, ValueError, RecursionError) as error:  # damaged, or of a version with other fields
                 raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
             if known.digest() != self.config.digest():
                 raise UserError("run.id", f"{self.run_id} exists with another config", "choose another id")
@@ -71,7 +92,13 @@ class Books:
 
     def _resumed(self) -> dict[str, Any] | None:
         path = self.dir / "tracking.json"
-        return json.loads(path.read_text()) if path.exists() else None
+        try:
+            known = json.loads(path.read_text()) if path.exists() else {}
+            if not isinstance(known, dict) or not isinstance(known.get("runs", {}), dict):
+                raise ValueError("it holds no runs")
+        except (ValueError, RecursionError) as error:
+            raise UserError(str(path), f"cannot be read ({error})", "remove it: MLflow gets new runs") from None
+        return known if known or self.attempt > 1 else None
 
     def _mend_metrics(self) -> None:
         """A process that died while it wrote a point leaves half a line."""
@@ -92,12 +119,49 @@ class Books:
                 self.run_id, member, kind, collected.sampler, sequence, steps, teams[key], float(scores[key])
             )
             self.ledger.record(entry)
-        self.ledger.flush()
+        self._flush_ledger()
 
     def record_steps(self, member: int, kind: Kind, name: str, sequence: int, steps: int, episodes: int) -> None:
-        """Enter steps that no sampler actor took, such as the final evaluation."""
+        """Enter steps that no sampler actor took."""
         self.ledger.record(LedgerEntry(self.run_id, member, kind, name, sequence, steps, episodes, 0.0))
+        self._flush_ledger()
+
+    def record_evaluation(self, member: int, steps: int, episodes: int) -> None:
+        """Enter the final evaluation, a run's last steps. Done again, it counts once: other figures replace the old."""
+        name = "evaluation"
+        entries = list(self.ledger)
+        before = next((i for i, e in enumerate(entries) if e.kind is Kind.EVALUATION and e.sampler == name), None)
+        if before is not None:
+            self.ledger.cut(before)
+        self.record_steps(member, Kind.EVALUATION, name, 0, steps, episodes)
+
+    def _flush_ledger(self) -> None:
         self.ledger.flush()
+        for kind in Kind:
+            if steps := self.ledger.steps(kind=kind):
+                gauge("popgen_environment_steps", steps, run=self.run_id, kind=str(kind))
+
+    def progress(self) -> tuple[int, int]:
+        """Members and ledger entries: a run that goes on comes to have more of them than it ever had."""
+        return len(self.population), len(self.ledger)
+
+    def checkpointed(self, member: int, iteration: int) -> None:
+        """Tell that a checkpoint is whole on disk, after `iteration` iterations of `member`: it is copied to the
+        storage. A storage that does not take it is told of and does not stop the run."""
+        self.iterations[member] = iteration
+        gauge("popgen_iteration", iteration, run=self.run_id, member=str(member))
+        steps = self.ledger.steps(member=member)
+        self.events.write("checkpoint", member=member, iteration=iteration, steps=steps)
+        self._copy()
+
+    def _copy(self) -> None:
+        if self.mirror is None:
+            return
+        try:
+            self.mirror.push()
+        except OSError as error:
+            text = f"{self.mirror.uri} did not take a copy ({' '.join(str(error).split())[:200]})"
+            self.events.write("note", level="WARNING", text=text)
 
     def training_steps(self, member: int) -> dict[str, int]:
         """This member's environment steps by kind, evaluation aside."""
@@ -106,6 +170,9 @@ class Books:
 
     def log(self, member: int, step: int, **figures: float) -> None:
         """One point of all given metrics, in metrics.jsonl and MLflow."""
+        if (free := self.disk.look()) is not None:
+            gauge("popgen_disk_free_bytes", free, run=self.run_id)
+        show_figures(self.run_id, member, figures)
         row = {"member": member, "step": step, "seconds": round(time.time() - self.began, 2)}
         with (self.dir / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(row | {k: _rounded(v) for k, v in figures.items()}) + "\n")
@@ -117,6 +184,9 @@ class Books:
         self.population.add_member(policy, seed=seed, steps=self.training_steps(member), training=training, extra=extra)
         self.tracker.log_scaling(member, sum(self.member_steps()))
         self.save_tracking()
+        gauge("popgen_members", member, run=self.run_id)
+        self.events.write("member", member=member, steps=sum(self.training_steps(member).values()))
+        self._copy()
 
     def member_steps(self) -> list[int]:
         """Environment steps that each member's training took, those of another run included."""
@@ -130,10 +200,41 @@ class Books:
         """Copy a member of another run; its steps stay in that run's ledger and in the member's record."""
         self.population.add_member(policy, seed=info.seed, steps=info.steps, training=training, extra=info.extra)
 
-    def close(self, status: str) -> None:
-        """Everything to disk; status is MLflow's FINISHED, FAILED or KILLED."""
-        self.ledger.flush()
-        self.tracker.finish(status)
+    def close(self, status: str, error: BaseException | None = None) -> None:
+        """Everything to disk; status is MLflow's FINISHED, FAILED or KILLED, `error` what ended the run."""
+        try:
+            self.ledger.flush()
+            self.tracker.finish(status)
+            if status == "FINISHED":
+                self._copy()
+        finally:
+            self._end(status, error)
+
+    def give_over(self, error: BaseException) -> None:
+        """An actor or a node died: this attempt ends, other books of this process go on with its tracker."""
+        try:
+            self.ledger.flush()
+        finally:
+            self._end("KILLED", error)
+
+    def _end(self, status: str, error: BaseException | None) -> None:
+        text = None if error is None else " ".join(str(error).split())[:500]
+        self.events.write("end", level="INFO" if error is None else "ERROR", status=status, error=text)
+        self.state.end(status, error)
+
+
+def named(config: RunConfig) -> RunConfig:
+    """The config with an id for its run: method, environment, seed and time, if it has none."""
+    if config.run.id:
+        return config
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+    name = f"{config.method}-{Path(config.env.name).stem}-s{config.run.seed}-{stamp}"
+    return config.model_copy(update={"run": config.run.model_copy(update={"id": name})})
+
+
+def run_folder(config: RunConfig) -> Path:
+    """Where a `named` run keeps everything."""
+    return Path(config.run.root) / str(config.run.id)
 
 
 def _replace(path: Path, text: str) -> None:

@@ -1,14 +1,15 @@
-"""Checkpoints: one of each finished member, and one at the boundary between two iterations of the running one.
+"""Checkpoints: one of each finished member, and those at the boundaries between iterations of the running one.
 
     checkpoints/
       member_001/        both buffers, the world model's learner and the ledger's length after member 1
-      progress/          of the running member: learners, samplers, generators, counters
+      progress_NNNNNN/   of the running member: learners, samplers, generators, counters; the last two are kept
       base_NNNNNN/       both buffers after segments_NNNNNN, where the log had become long
       segments_NNNNNN    the log: what was sampled since the last member, one file for each call of a sampler
 
 The buffers are large and only ever grow at their end, so that an iteration's checkpoint holds a reference to the last
-whole copy of them and the number of segment files to add to it. `progress` is replaced atomically, and names
-everything it needs: whatever interrupts the writing, the old checkpoint or the new one is there.
+whole copy of them and the number of segment files to add to it. `progress` appears at once, by a rename, and names
+everything it needs: whatever interrupts the writing, the old checkpoint or the new one is there. Should the newest be
+damaged, the one before it counts.
 """
 
 from __future__ import annotations
@@ -16,12 +17,45 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from popgen.data.checkpoint import load_state, save_state
 from popgen.data.segments import load_segments, save_segments
+from popgen.errors import UserError
 from popgen.types import Segment
+
+KEPT = 2
+"""Checkpoints of the running member that are there at any time, once there were so many."""
+
+
+@contextmanager
+def fitting(folder: Path) -> Iterator[None]:
+    """Around what puts a checkpoint's parts where they belong: parts that do not fit are told in one line.
+
+    Raises:
+        UserError: a part is missing, or of another size or type.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        cause = getattr(error, "cause", error)  # Ray's error of an actor is of both types
+        reason = f"no {cause}" if isinstance(cause, KeyError) else str(cause).partition("\n")[0]
+        problem = f"its checkpoint does not fit this run ({reason})"
+        raise UserError(str(folder), problem, "remove it or start a new run") from None
+
+
+def _log_of(folder: Path, state: dict[str, Any]) -> dict[str, Any]:
+    """The part about the log, of a state that is a running member's."""
+    log = state.get("log")
+    found = log if isinstance(log, dict) else {}
+    counts = (state.get("member"), state.get("ledger"), *(found.get(name) for name in ("first", "count", "rows")))
+    if any(type(count) is not int or count < 0 for count in counts) or not isinstance(found.get("base"), str | None):
+        raise UserError(str(folder), "is no checkpoint of a running member", "remove it or start a new run")
+    return found
 
 
 def member_folder(root: Path, member: int) -> Path:
@@ -36,6 +70,9 @@ class Checkpoints:
         root: the run's folder.
         long: rows in the log from which on a whole copy of the buffers is written.
         seconds: least time between two checkpoints.
+
+    Attributes:
+        note: what `load` has to say about a damaged checkpoint.
     """
 
     def __init__(self, root: Path, *, long: int, seconds: float) -> None:
@@ -43,22 +80,35 @@ class Checkpoints:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.base: str | None = None
         self.first = self.count = self.rows = 0
+        self.needed: dict[int, dict[str, Any]] = {}
         self.last = time.monotonic()
+        self.note = ""
 
     def load(self, member: int) -> dict[str, Any] | None:
-        """The running member's last checkpoint, None if there is none of this member.
+        """The running member's last whole checkpoint, None if there is none of this member.
 
         Raises:
-            UserError: it is damaged.
+            UserError: all are damaged.
         """
-        if not self._progress.exists() and not self._progress.with_name("progress.old").exists():
-            return None
-        state = load_state(self._progress)
-        if state["member"] != member:
-            return None
-        log = state["log"]
-        self.base, self.first, self.count, self.rows = log["base"], log["first"], log["count"], log["rows"]
-        return state
+        damage: UserError | None = None
+        for number in reversed(self._numbers()):
+            try:
+                state = load_state(self._progress(number))
+                log = _log_of(self._progress(number), state)
+            except UserError as error:
+                damage = damage or error
+                continue
+            if damage is not None:
+                self.note = f"{damage.field}: {damage.problem}; the checkpoint before it counts"
+                self._drop_progress(above=number)
+            if state["member"] != member:
+                return None
+            self.base, self.first, self.count, self.rows = log["base"], log["first"], log["count"], log["rows"]
+            self.needed = {number: log}
+            return state
+        if damage is not None:
+            raise damage
+        return None
 
     def begin(self, base: Path | None) -> None:
         """A new member: nothing to go back to but `base`, a checkpoint of a finished member."""
@@ -66,8 +116,11 @@ class Checkpoints:
             shutil.rmtree(path, ignore_errors=True)
         for path in self.folder.glob("segments_*"):
             path.unlink()
-        self.base = None if base is None else str(base.resolve())
+        # By its name if it is our own: the folder may go on elsewhere.
+        own = base is not None and base.resolve().parent == self.folder.resolve()
+        self.base = None if base is None else base.name if own else str(base.resolve())
         self.first = self.count = self.rows = 0
+        self.needed = {}
         self.last = time.monotonic()
 
     def keep(self, segments: list[Segment], owner: int) -> None:
@@ -87,14 +140,25 @@ class Checkpoints:
             save_state(self.folder / name, replays())
             self.base, self.first, self.rows = name, self.count, 0
         log = {"base": self.base, "first": self.first, "count": self.count, "rows": self.rows}
-        save_state(self._progress, {**state, "member": member, "log": log})
+        number = max((0, *self._numbers())) + 1
+        save_state(self._progress(number), {**state, "member": member, "log": log})
+        self.needed[number] = log
+        self._tidy()
+        self.last = time.monotonic()
+
+    def _tidy(self) -> None:
+        """Remove what none of the kept checkpoints needs."""
+        self.needed = {number: self.needed[number] for number in sorted(self.needed)[-KEPT:]}
+        for number in self._numbers():
+            if number not in self.needed:
+                shutil.rmtree(self._progress(number), ignore_errors=True)
+        bases, first = {log["base"] for log in self.needed.values()}, min(log["first"] for log in self.needed.values())
         for path in self.folder.glob("base_*"):
-            if path.name != self.base:
+            if path.name not in bases:
                 shutil.rmtree(path, ignore_errors=True)
         for path in self.folder.glob("segments_*"):
-            if int(path.name.rpartition("_")[2]) < self.first:
+            if int(path.name.rpartition("_")[2]) < first:
                 path.unlink()
-        self.last = time.monotonic()
 
     def replays(self) -> dict[str, Any] | None:
         """The whole copy of the buffers that the loaded checkpoint starts from; None for empty ones."""
@@ -105,9 +169,18 @@ class Checkpoints:
         for number in range(self.first, self.count):
             yield load_segments(self._segments(number))
 
-    @property
-    def _progress(self) -> Path:
-        return self.folder / "progress"
+    def _numbers(self) -> list[int]:
+        """Of the checkpoints that are there, ascending."""
+        names = (path.name.partition("_")[2] for path in self.folder.glob("progress_*"))
+        return sorted(int(name) for name in names if name.isdecimal())
+
+    def _drop_progress(self, above: int) -> None:
+        for number in self._numbers():
+            if number > above:
+                shutil.rmtree(self._progress(number), ignore_errors=True)
+
+    def _progress(self, number: int) -> Path:
+        return self.folder / f"progress_{number:06d}"
 
     def _segments(self, number: int) -> Path:
         return self.folder / f"segments_{number:06d}"

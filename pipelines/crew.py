@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,7 @@ def start_ray(cluster: ClusterConfig) -> bool:
     # Quiet: Ray warns once about the accelerator variable it will stop overriding.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     local = cluster.address is None
+    limits = {"object_store_memory": cluster.object_store_bytes} if local and cluster.object_store_bytes else {}
     try:
         ray.init(
             # Without an address Ray would look for a running cluster before it starts a local one.
@@ -37,11 +38,10 @@ def start_ray(cluster: ClusterConfig) -> bool:
             include_dashboard=False if local else None,
             log_to_driver=False,
             logging_level="ERROR",
+            **limits,
         )
     except ConnectionError as error:
         raise UserError("cluster.address", f"no Ray answers ({error})", "start it, or use cluster=laptop") from None
-    if not local:
-        check_resources(cluster, ray.cluster_resources())
     return True
 
 
@@ -58,6 +58,25 @@ def check_resources(cluster: ClusterConfig, have: Mapping[str, float]) -> None:
         if amount > have.get(name, 0.0):
             problem = f"the actors ask for {amount:g} {name}, the cluster has {have.get(name, 0.0):g}"
             raise UserError("cluster", problem, "ask for less, or wait until its nodes are up")
+
+
+def check_nodes(cluster: ClusterConfig, nodes: Sequence[Mapping[str, float]]) -> None:
+    """Each actor must fit on one of the nodes, whose resources are given by name.
+
+    Raises:
+        UserError: one of them fits on none.
+    """
+    wanted = {
+        "sampler_cpus": {"CPU": cluster.sampler_cpus},
+        "replay_cpus": {"CPU": cluster.replay_cpus},
+        "model_cpus": {"CPU": cluster.model_cpus, "GPU": cluster.model_gpus},
+        "agent_cpus": {"CPU": cluster.agent_cpus, "GPU": cluster.agent_gpus},
+    }
+    for field, needed in wanted.items():
+        needed = {name: amount for name, amount in {**needed, **cluster.resources}.items() if amount}
+        if not any(all(amount <= node.get(name, 0.0) for name, amount in needed.items()) for node in nodes):
+            told = " and ".join(f"{amount:g} {name}" for name, amount in needed.items())
+            raise UserError(f"cluster.{field}", f"no node has {told}", "ask for less, or wait until its nodes are up")
 
 
 @dataclass

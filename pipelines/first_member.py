@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+import time
+from collections import Counter, deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,8 @@ import numpy as np
 import ray
 
 from actors.sampler import Collected, PolicyParts
-from pipelines.rounds import run_rounds
+from pipelines.checkpoints import fitting
+from pipelines.rounds import Pace, run_rounds
 from pipelines.snapshot import Published, Snapshot
 from popgen.algos.xpm_wm.starts import Starts
 from popgen.data.sampler import Team
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from pipelines.xpm_wm import XpmWm
 
 MEMBER = 1
+LEARNERS = ("model", "agent")
 PREFILL_CHUNK = 400
 PIECE = 100
 """World-model updates between two signs of progress."""
@@ -41,6 +44,9 @@ class FirstMember:
         self.rounds = self.since_best = 0
         self.top: Snapshot | None = None
         self.restarted = False
+        self.busy: Counter[str] = Counter()
+        self.cpu: Counter[str] = Counter()
+        self.report: Any = None
 
     def train(self, saved: dict[str, Any] | None) -> Snapshot:
         """Until the budget, the target or the patience ends; `saved` is a checkpoint to go on from."""
@@ -51,21 +57,25 @@ class FirstMember:
             self._pretrain()
         else:
             self.driver.restore_learners(saved)
-            self._restore(saved["first_member"])
+            with fitting(self.driver.checkpoints.folder):
+                self._restore(saved["first_member"])
         self.driver.reporter.phase("member 1: self-play", self.phase.max_steps)
         self._sit_down()
         if saved is None:
             self._save()
         else:
-            crew.players.load_state(saved["samplers"])
-        checkpoints = self.driver.checkpoints
+            with fitting(self.driver.checkpoints.folder):
+                crew.players.load_state(saved["samplers"])
+        checkpoints, work = self.driver.checkpoints, self._work()
+        self.pace, self.began = Pace(work, LEARNERS, self.config.run.overlap), time.perf_counter()
         run_rounds(
-            self._work(),
+            work,
             stop=self._stop,
             after=self._after,
             schedule=self.config.run.schedule,
             due=checkpoints.due,
             save=self._save,
+            pace=self.pace,
         )
         return self._best()
 
@@ -135,17 +145,24 @@ class FirstMember:
 
     def _sampled(self, result: tuple[Any, Collected]) -> None:
         segments, collected = result
+        self.cpu["sampler"] += collected.cpu_seconds
         self.driver.absorb(MEMBER, segments, collected)
         self.recent.extend(e.score for e in collected.episodes)
         self.shaped.extend(e.shaped for e in collected.episodes)
 
     def _model_learned(self, result: tuple[Any, Any, dict[str, float]]) -> None:
         self.model, self.starts, metrics = result
+        self._worked("model", metrics)
         self.figures |= {f"model/{name}": value for name, value in metrics.items()}
 
     def _agent_learned(self, result: tuple[Any, ...]) -> None:
         self.published, metrics = self._publish(result)
+        self._worked("agent", metrics)
         self.figures |= {f"agent/{name}": value for name, value in metrics.items()}
+
+    def _worked(self, learner: str, metrics: dict[str, float]) -> None:
+        self.busy[learner] += metrics["seconds"]
+        self.cpu[learner] += metrics["cpu_seconds"]
 
     def _after(self) -> None:
         """Book-keeping at the end of a round."""
@@ -156,13 +173,27 @@ class FirstMember:
                 "real_sp": float(np.mean(self.recent)),
                 "real_shaped_sp": float(np.mean(self.shaped)) / driver.spec.horizon,
             }
-        if self.rounds % self.phase.check_every == 0:
-            self.figures |= {f"report/{k}": v for k, v in ray.get(driver.crew.model.report.remote()).items()}
+        self._look_into_the_model()
+        self.figures |= self.pace.figures() | self._idle()
         driver.log(MEMBER, **self.figures)
         self._keep_best()
         self._restart_if_due()
         score = round(self.figures.get("real_sp", 0.0), 2)
         driver.reporter.update(driver.steps, steps=driver.steps, **{driver.spec.score_name: score})
+
+    def _look_into_the_model(self) -> None:
+        """Now and then its report; with `async` it is taken in when it is there, and nothing waits for it."""
+        if self.report is None and self.rounds % self.phase.check_every == 0:
+            self.report = self.driver.crew.model.report.remote()
+        wait = None if self.config.run.schedule == "sync" else 0.0
+        if self.report is not None and ray.wait([self.report], timeout=wait)[0]:
+            self.figures |= {f"report/{k}": v for k, v in ray.get(self.report).items()}
+            self.report = None
+
+    def _idle(self) -> dict[str, float]:
+        """idle/LEARNER: the share of the time since these rounds began in which it was not at work."""
+        passed = max(1e-9, time.perf_counter() - self.began)
+        return {f"idle/{name}": max(0.0, 1.0 - self.busy[name] / passed) for name in LEARNERS}
 
     @property
     def _full(self) -> bool:
@@ -216,7 +247,7 @@ class FirstMember:
             "figures": dict(self.figures),
             "counters": [self.rounds, self.since_best, self.restarted],
         }
-        self.driver.save(MEMBER, {"first_member": state, "samplers": self.driver.crew.players.state()})
+        self.driver.save(MEMBER, self.rounds, {"first_member": state, "samplers": self.driver.crew.players.state()})
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.model, self.starts = ray.put(state["model"]), ray.put(Starts(**state["starts"]))

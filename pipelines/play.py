@@ -18,17 +18,28 @@ class Players:
     def __init__(self, samplers: list[Any]) -> None:
         self.samplers = samplers
         self.active: list[int] = []
+        self._stored: dict[int, tuple[PolicyParts, Any]] = {}
 
     def open(self, teams: list[Team], parts: dict[int, PolicyParts], seed: int, stagger: bool = False) -> None:
-        """Start fresh episodes; every sampler gets the policies of its own teams and a seed of its own."""
+        """Start fresh episodes; every sampler gets the policies of its own teams and a seed of its own.
+
+        Policies travel as references: a member's weights go into the object store once, and from there once to each
+        node, for as long as `parts` holds the same weights for it.
+        """
+        self._store(parts)
         shares = split_teams(teams, len(self.samplers))
         self.active = [index for index, share in enumerate(shares) if share]
         opened = []
         for index in self.active:
             present = sorted({member for team in shares[index] for member in team.members})
-            own = {member: parts[member] for member in present}
+            own = {member: self._stored[member][1] for member in present}
             opened.append(self.samplers[index].open.remote(shares[index], own, seed_of(seed, index), stagger))
         ray.get(opened)
+
+    def _store(self, parts: dict[int, PolicyParts]) -> None:
+        known = self._stored
+        same = {m for m, p in parts.items() if m in known and known[m][0].weights is p.weights and p.weights}
+        self._stored = {m: known[m] if m in same else (p, ray.put(p)) for m, p in parts.items()}
 
     def start(self, index: int, steps: int, member: int | None = None, weights: Any = None) -> tuple[Any, Any]:
         """Let one sampler play, with new weights (a reference) for one member: references to segments and counts."""

@@ -5,25 +5,29 @@ A method is a driver: a class that trains the members which the run's books do n
 
 from __future__ import annotations
 
+import sys
 import time
 from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
 import ray
+from ray.exceptions import RayError
 
 from actors.common import build_env, settle
-from pipelines.books import Books
+from pipelines.books import Books, named, run_folder
 from pipelines.crew import start_ray
 from pipelines.report import write_run_figures
+from pipelines.survival import Patience, death, first_line, nodes_alive, told, wait_for_room
+from pipelines.watch import LoggingReporter, gauge
 from popgen.config import RunConfig
+from popgen.data.storage import Mirror
 from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import evaluate_population
 from popgen.evaluation.report import to_dict, write_report
 from popgen.population import load_population
 from popgen.progress import Reporter
-from popgen.types import Kind
 
 DRIVERS: dict[str, str] = {
     "xpm_wm": "pipelines.xpm_wm:XpmWm",
@@ -45,7 +49,8 @@ class Driver(Protocol):
         """Train every member that `books.population` does not hold, and add it with `books.add_member`.
 
         Every environment step goes to `books.ledger` before the member that it was spent on is added. An
-        interrupted run is the same call again.
+        interrupted run is the same call of another driver, with other books on the same folder: in another process, or
+        in this one after an actor or a node died, for which `run` raises Ray's error once its own actors are gone.
 
         Raises:
             FloatingPointError: training diverged.
@@ -60,7 +65,7 @@ def driver_class(method: str) -> type[Driver]:
 
 
 def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
-    """Train a population by `config.method` and evaluate it.
+    """Train a population by `config.method` and evaluate it, over the deaths of actors and nodes.
 
     Args:
         config: a validated run.
@@ -71,29 +76,94 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         (`popgen.evaluation.report`), files (paths by name or suffix), seconds.
 
     Raises:
-        UserError: training diverged, the disk is full, or a checkpoint to go on from is damaged.
+        UserError: training diverged, the disk is (nearly) full, a checkpoint to go on from is damaged, another process
+            is at this run, or actors died `cluster.retries` times in a row without progress.
     """
     settle(config.cluster.threads)
     spec = build_env(config.env, 1).spec
+    config = named(config)
+    if config.run.storage and (restored := Mirror(run_folder(config), config.run.storage).pull()):
+        reporter.note(restored)
     books = Books(config, spec)
     reporter.note(f"run {books.run_id} in {books.dir}")
-    mine, status = False, "FAILED"
+    job = _Job(config, spec, books, reporter)
+    status = "FAILED"
     try:
-        mine = start_ray(config.cluster)
-        books.tracker.start()
-        books.save_tracking()
-        driver_class(config.method)(config, spec, books, reporter).run()
-        result = finish(config, spec, books, reporter)
+        result = job.run()
         status = "FINISHED"
         return result
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):  # Ray turns SIGTERM into the latter
         status = "KILLED"
         raise
     except FloatingPointError as error:  # of a learner; Ray wraps it in an error of both types
         raise UserError("training", str(getattr(error, "cause", error)), "lower the learning rates") from None
+    except RayError as error:
+        if (known := told(error)) is error:
+            raise
+        raise known from None
     finally:
-        books.close(status)
-        if mine:
+        try:
+            job.books.close(status, None if status == "FINISHED" else sys.exception())
+        finally:
+            job.end()
+
+
+class _Job:
+    """One run in this process: attempts, until one of them reaches the end."""
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> None:
+        self.config, self.spec, self.books, self.reporter = config, spec, books, reporter
+        self.began, self.mine = time.time(), False
+
+    def run(self) -> dict[str, Any]:
+        """Train and evaluate; after a death everything again from the books on disk."""
+        patience = Patience(self.config.cluster.retries)
+        self._start_ray()
+        while True:
+            try:
+                return self._attempt()
+            except Exception as error:
+                cause = death(error)
+                if cause is None:
+                    raise
+                patience.again(self.books.progress(), cause)
+                lost = first_line(cause)
+            # Outside of the except clause: the error's frames hold what is left of the last attempt.
+            self._go_on(lost, patience.spent)
+
+    def _start_ray(self) -> None:
+        """Connect to a cluster and wait for its nodes, or start a local Ray, unless there is one."""
+        cluster = self.config.cluster
+        self.mine = start_ray(cluster)
+        if self.mine and cluster.address is not None:
+            wait_for_room(cluster, self.reporter.note)
+
+    def _attempt(self) -> dict[str, Any]:
+        books = self.books
+        reporter = LoggingReporter(self.reporter, books.events)
+        books.tracker.start()
+        books.save_tracking()
+        driver_class(self.config.method)(self.config, self.spec, books, reporter).run()
+        result = finish(self.config, self.spec, books, reporter)
+        return result | {"seconds": round(time.time() - self.began, 1)}
+
+    def _go_on(self, lost: str, spent: int) -> None:
+        """Other books, on a cluster that has room; a local Ray that lost its node, or fails again, starts anew."""
+        self.reporter.note(f"{lost}: going on from the last checkpoint")
+        self.books.events.write("lost", level="WARNING", text=lost)
+        self.books.give_over(RuntimeError(lost))
+        tracker = self.books.tracker
+        if self.mine and (spent > 1 or not nodes_alive()):
+            tracker.forget()
+            ray.shutdown()
+            self._start_ray()
+        wait_for_room(self.config.cluster, self.reporter.note)
+        self.books = Books(self.config, self.spec, tracker)
+        gauge("popgen_restarts", self.books.attempt - 1, run=self.books.run_id)
+
+    def end(self) -> None:
+        """Ray ends with the job that started it."""
+        if self.mine:
             ray.shutdown()
 
 
@@ -110,7 +180,7 @@ def finish(config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -
     files = write_report(result, books.dir / "report")
     size = len(books.population)
     episodes = result.episodes * len(result.pairings)
-    books.record_steps(size, Kind.EVALUATION, f"evaluation.{books.attempt}", 0, result.steps, episodes)
+    books.record_evaluation(size, result.steps, episodes)
     files |= write_run_figures(
         books.dir, books.dir / "report", books.member_steps(), unit=spec.score_name, title=spec.name
     )

@@ -11,7 +11,7 @@ import ray
 
 from actors.sampler import Collected, PolicyParts
 from pipelines.books import Books
-from pipelines.checkpoints import Checkpoints, member_folder
+from pipelines.checkpoints import Checkpoints, fitting, member_folder
 from pipelines.crew import Crew
 from pipelines.first_member import FirstMember
 from pipelines.later_member import LaterMember
@@ -20,6 +20,7 @@ from popgen.config import RunConfig
 from popgen.data.checkpoint import load_state, save_state
 from popgen.data.sampler import Episode
 from popgen.envs.base import EnvSpec
+from popgen.errors import UserError
 from popgen.nets.weights import Weights
 from popgen.policies.world_model_policy import WorldModelPolicy
 from popgen.population import load_population
@@ -30,6 +31,8 @@ SP_KINDS = (str(Kind.SP), str(Kind.RANDOM))
 XP_KINDS = (str(Kind.XP),)
 LEARNERS = ("model", "agent")
 REPLAYS = ("replay_sp", "replay_xp")
+HALT_SECONDS = 30.0
+"""Least time between two checkpoints with schedule=async, where all work halts for one."""
 
 
 class XpmWm:
@@ -39,7 +42,8 @@ class XpmWm:
         self.config, self.spec, self.books, self.reporter = config, spec, books, reporter
         self.crew = Crew.hire(config, f"{books.run_id}.{books.attempt}")
         long = max(1, config.replay.capacity // 2)
-        self.checkpoints = Checkpoints(books.dir, long=long, seconds=config.run.checkpoint_seconds)
+        seconds = max(config.run.checkpoint_seconds, HALT_SECONDS if config.run.schedule == "async" else 0.0)
+        self.checkpoints = Checkpoints(books.dir, long=long, seconds=seconds)
         self.members: dict[int, Weights] = {}
         self.steps = 0
 
@@ -124,17 +128,27 @@ class XpmWm:
 
     # ---- resume --------------------------------------------------------------------------------------------------
 
-    def save(self, member: int, state: dict[str, Any]) -> None:
-        """The checkpoint between two iterations: the members' part, and what is common to them."""
+    def save(self, member: int, iteration: int, state: dict[str, Any]) -> None:
+        """The checkpoint after `iteration` iterations: the members' part, and what is common to them."""
         crew = self.crew
         common = {name: getattr(crew, name).state.remote() for name in LEARNERS}
         marks = {name: getattr(crew, name).marks.remote() for name in REPLAYS}
         state = state | dict(zip(common, ray.get([*common.values()]), strict=True))
         state["marks"] = dict(zip(marks, ray.get([*marks.values()]), strict=True))
         self.checkpoints.save(member, {**state, "steps": self.steps, "ledger": len(self.books.ledger)}, self._replays)
+        self.books.checkpointed(member, iteration)
 
     def restore_learners(self, saved: dict[str, Any]) -> None:
-        """Buffers, world model and agent as `save` found them; the member must have begun."""
+        """Buffers, world model and agent as `save` found them; the member must have begun.
+
+        Raises:
+            UserError: a damaged part, or one that does not fit.
+        """
+        with fitting(self.checkpoints.folder):
+            self._restore(saved)
+        self.reporter.note(f"going on after {self.steps:,} steps of member {saved['member']}")
+
+    def _restore(self, saved: dict[str, Any]) -> None:
         crew = self.crew
         whole = self.checkpoints.replays()
         for name in REPLAYS if whole else ():
@@ -148,7 +162,6 @@ class XpmWm:
             ray.get(list(added))
         ray.get([getattr(crew, name).load_marks.remote(saved["marks"][name]) for name in REPLAYS])
         ray.get([getattr(crew, name).load_state.remote(saved[name]) for name in LEARNERS])
-        self.reporter.note(f"going on after {self.steps:,} steps of member {saved['member']}")
 
     def _replays(self) -> dict[str, Any]:
         states = ray.get([getattr(self.crew, name).state.remote() for name in REPLAYS])
@@ -166,6 +179,8 @@ class XpmWm:
         else:
             root, known = self.books.dir, present
         saved = self.checkpoints.load(known + 1)
+        if self.checkpoints.note:
+            self.reporter.note(self.checkpoints.note)
         if not known:
             self._forget(saved["ledger"] if saved else 0)
             return 0, None, saved
@@ -187,5 +202,9 @@ class XpmWm:
 
     def _forget(self, entries: int | None) -> None:
         """Work that no checkpoint holds will be done again: its steps leave the ledger (None: unknown, all stay)."""
+        held = len(self.books.ledger)
+        if entries is not None and entries > held:
+            problem = f"has {held} entries, the checkpoint knows {entries}"
+            raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
         if entries is not None and (lost := self.books.ledger.cut(entries)):
             self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")

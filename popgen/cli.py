@@ -12,14 +12,18 @@ import errno
 import json
 import math
 import os
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import popgen
 from popgen.errors import UserError
 from popgen.jsonable import jsonable
+
+if TYPE_CHECKING:
+    from popgen.config import RunConfig
 
 OK, ERROR, INTERRUPTED = 0, 2, 130
 ALIASES = {"seed": "run.seed"}
@@ -48,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
+    except RecursionError:
+        return _fail(str(UserError("input", "is nested too deeply", "give plain values")))
     except MemoryError as error:
         return _fail(str(UserError("memory", f"is not enough ({error})", "ask for less at a time")))
     except OSError as error:
@@ -196,6 +202,128 @@ def _show(args: argparse.Namespace) -> int:
     return OK
 
 
+def _runs(args: argparse.Namespace) -> int:
+    from pipelines.runs import list_runs
+
+    runs = list_runs(Path(args.root))
+    if args.json:
+        _print_json({"root": args.root, "runs": runs})
+        return OK
+    from rich.markup import escape
+    from rich.table import Table
+
+    names = ("run", "state", "method", "environment", "member", "environment steps", "minutes", "last error")
+    table = Table(*names, title=f"runs in {args.root}", title_justify="left")
+    for run in runs:
+        member = "-" if run["size"] is None else f"{run['member']} of {run['size']}"
+        steps = ", ".join(f"{kind} {count:,}" for kind, count in run["steps"].items())
+        cells = (run["id"], run["state"], run["method"], run["environment"], member, steps)
+        error = _short(" ".join((run["error"] or "").split()))
+        table.add_row(*(escape(str(cell or "-")) for cell in cells), f"{run['seconds'] / 60:.1f}", escape(error))
+    _print_table(table)
+    return OK
+
+
+def _compare(args: argparse.Namespace) -> int:
+    starts = []
+    for words in args.start:
+        label = next((word.partition("=")[2] for word in words if word.startswith("label=")), None)
+        overrides = [word for word in words if not word.startswith("label=")]
+        starts.append((label, _started([*overrides, *args.set], Path(args.out) / "runs")))
+    _check_started([config for _, config in starts], args.out)
+    from pipelines.compare import EXPERIMENT, compare_runs
+    from popgen.config import TrackingConfig
+    from popgen.evaluation.comparison_report import to_tables
+    from popgen.progress import make_reporter
+    from popgen.tracking import check_uri
+
+    tracking = TrackingConfig(enabled=not args.no_tracking, uri=args.tracking_uri, experiment=EXPERIMENT)
+    check_uri(tracking.uri)
+    reporter = make_reporter(quiet=args.quiet)
+    try:
+        report = compare_runs(
+            *(args.runs, starts, args.out),
+            agents=args.agents,
+            sp=args.sp,
+            xp=args.xp,
+            tracking=tracking,
+            reporter=reporter,
+        )
+    finally:
+        reporter.close()
+    if args.json:
+        _print_json(report)
+        return OK
+    for table in to_tables(report):
+        _print_table(table)
+    print("\n".join([*report["notes"], f"report: {args.out} ({', '.join(report['files'])})"]))
+    return OK
+
+
+def _self_sabotage(args: argparse.Namespace) -> int:
+    methods = args.method or ([] if args.population else ["lipo", "comedi", "xpm_sim"])
+    if args.overrides and not methods:
+        raise UserError("overrides", "have no use where nothing is trained", "name what to train with --method")
+    from popgen.evaluation.sabotage_report import NOTES, TERMINATIONS, summary, to_tables
+
+    rules = list(TERMINATIONS) if args.termination == "both" else [args.termination]
+    base = [] if any(word.startswith("env=") for word in args.overrides) else ["env=rendezvous/mppmr"]
+    base += ["population.size=8", *args.overrides]
+    configs = [
+        _started(
+            [
+                *base,
+                f"method={method}",
+                f"env.params.exit_penalty={TERMINATIONS[rule]['exit_penalty']}",
+                f"seed={seed}",
+            ],
+            Path(args.out) / "runs",
+        )
+        for rule in rules
+        for method in methods
+        for seed in args.seeds
+    ]
+    _check_started(configs, args.out)
+    from pipelines.experiments import self_sabotage
+    from popgen.progress import make_reporter
+
+    reporter = make_reporter(quiet=args.quiet)
+    try:
+        report = self_sabotage(
+            args.population, configs, args.out, episodes=args.episodes, seed=args.seed, reporter=reporter
+        )
+    finally:
+        reporter.close()
+    if args.json:
+        _print_json(report)
+        return OK
+    for table in to_tables(report):
+        _print_table(table)
+    print("\n".join([*NOTES, *summary(report), f"report: {args.out} ({', '.join(report['files'])})"]))
+    return OK
+
+
+def _started(overrides: Sequence[str], root: Path) -> RunConfig:
+    """A run for a command that starts several: in a folder under `root` that its settings decide."""
+    from pipelines.batch import named
+    from popgen.config import RunConfig
+
+    return named(RunConfig.parse(compose(overrides)), root)
+
+
+def _check_started(configs: Sequence[RunConfig], out: str) -> None:
+    """Everything that can be known before the first of them starts, and the place of the report."""
+    from pipelines.batch import check_different
+    from popgen.preflight import check_root, preflight
+
+    check_different(configs)
+    for config in configs:
+        preflight(config)
+    check_root(Path(out), 16 * 2**20, "--out")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _bound_threads(max((config.cluster.threads for config in configs), default=1))
+
+
 def _bench(args: argparse.Namespace) -> int:
     from pipelines.bench import bench_env
 
@@ -206,6 +334,61 @@ def _bench(args: argparse.Namespace) -> int:
         ratio = "" if result["ratio"] is None else f"   {result['ratio']:,.0f} times the reference"
         print(f"{args.env}: {result['steps_per_second']:,.0f} environment steps a second{ratio}")
     return OK
+
+
+def _bench_scale(args: argparse.Namespace) -> int:
+    from popgen.config import RunConfig
+    from popgen.preflight import preflight
+
+    config = RunConfig.parse(compose([*args.overrides, "method=xpm_wm"]))
+    preflight(config)
+    _bound_threads(config.cluster.threads)
+    from pipelines.bench_scale import bench_scale
+
+    tell = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
+    result = bench_scale(config, samplers=args.samplers, seconds=args.seconds, tell=tell)
+    if args.json:
+        _print_json(result)
+    else:
+        _print_scale(result)
+    return OK
+
+
+def _bench_mappo(args: argparse.Namespace) -> int:
+    from popgen.config import RunConfig
+    from popgen.preflight import preflight
+
+    config = RunConfig.parse(compose([*args.overrides, "method=mappo"]))
+    preflight(config)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _bound_threads(config.cluster.threads)
+    from pipelines.bench_mappo import bench_mappo
+
+    result = bench_mappo(config, seconds=args.seconds)
+    if args.json:
+        _print_json(result)
+    else:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in result["shares"].items())
+        print(f"{result['env']}: {result['steps_per_second']:,} environment steps a second end to end ({shares})")
+        print(f"{result['steps_per_cpu_second']:,} a second of processor time, {result['threads']} threads")
+    return OK
+
+
+def _print_scale(result: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    measured = Table("samplers", "steps/s", "model's", "world model idle", "agent idle", title="measured here")
+    for row in result["measured"]:
+        idle = (f"{row['idle'][name]:.0%}" for name in ("model", "agent"))
+        rates = (f"{row[name]:,.0f}" for name in ("steps_per_second", "model_steps_per_second"))
+        measured.add_row(str(row["samplers"]), *rates, *idle)
+    _print_table(measured)
+    model = Table("samplers", "steps/s", "world model idle", "agent idle", title="model: a core for each")
+    for nodes, row in result["model"].items():
+        model.add_row(nodes, f"{row['steps_per_second']:,.0f}", f"{row['idle_model']:.0%}", f"{row['idle_agent']:.0%}")
+    _print_table(model)
+    costs = ", ".join(f"{name} {value:.3g}" for name, value in result["costs"].items())
+    print("\n".join([f"a round costs (s; steps; bytes): {costs}", *(f"assumed: {a}" for a in result["assumptions"])]))
 
 
 def _print_table(table: Any) -> None:
@@ -302,7 +485,8 @@ def _composition_error(error: Exception, overrides: Sequence[str]) -> UserError:
         )
     if text.startswith("Config group override"):  # a number or nothing where a name belongs
         groups = {override.partition("=")[0]: override.partition("=")[2] for override in overrides}
-        return next(_unknown_option(group, option) for group, option in groups.items() if group_options(group))
+        known = {group: group_options(group) for group in groups}
+        return next(_unknown_option(g, option) for g, option in groups.items() if known[g] and option not in known[g])
     if text.startswith("Could not override '"):
         return unknown_field(text.split("'")[1])
     first = text.partition("\n")[0]
@@ -354,6 +538,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=_Parser)
     _add_run(commands)
     _add_population_commands(commands)
+    _add_compare(commands)
+    _add_experiment(commands)
     bench = commands.add_parser("bench", help="measure speed", description="Measure speed.")
     kinds = bench.add_subparsers(title="what to measure", metavar="WHAT", required=True, parser_class=_Parser)
     env = _command(
@@ -367,6 +553,27 @@ def _parser() -> argparse.ArgumentParser:
     env.add_argument("--env", default="overcooked/cramped_room", help="registry name (%(default)s)")
     env.add_argument("--envs", type=_at_least(1), default=1024, help="environments stepped together (%(default)s)")
     env.add_argument("--seconds", type=_positive, default=2.0, help="time per measurement (%(default)s)")
+    mappo = _command(
+        kinds,
+        "mappo",
+        _bench_mappo,
+        "MAPPO's training of self-play on RLlib, end to end",
+        "Keys of --json: steps_per_second, steps_per_cpu_second, shares (sampling, pooling, gradients, rllib), env, "
+        "threads, runners, envs, iterations, steps, seconds, cpu_seconds.",
+    )
+    mappo.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
+    mappo.add_argument("--seconds", type=_positive, default=20.0, help="time of the measurement (%(default)s)")
+    scale = _command(
+        kinds,
+        "scale",
+        _bench_scale,
+        "sampling and idle learners with several samplers, and a model of more nodes",
+        "Keys of --json: measured (samplers, steps_per_second, idle, model_steps_per_second), costs of a round, model "
+        "(samplers -> steps_per_second, idle_model, idle_agent), assumptions, cores, network_bytes_per_second, env.",
+    )
+    scale.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
+    scale.add_argument("--samplers", type=_numbers, default=[1, 2, 4], metavar="1,2,...", help="how many (1,2,4)")
+    scale.add_argument("--seconds", type=_positive, default=30.0, help="time per measurement (%(default)s)")
     return parser
 
 
@@ -413,6 +620,83 @@ def _add_population_commands(commands: Any) -> None:
         "(member.json with total_steps, bytes and parameters).",
     )
     show.add_argument("population", metavar="POPULATION", help="folder that holds manifest.json")
+    runs = _command(
+        commands,
+        "runs",
+        _runs,
+        "the runs in a folder: state, member, environment steps, last error",
+        "States: running, finished, failed, interrupted (`popgen run` with the same run.id goes on), damaged. Keys of "
+        "--json: root, and runs, each with id, state, method, scale, environment, member (that is trained) of size, "
+        "steps (by kind), total_steps, seconds (of all attempts), attempt, began (seconds since 1970), error.",
+    )
+    runs.add_argument("root", metavar="ROOT", nargs="?", default="runs", help="folder of the runs (%(default)s)")
+
+
+def _add_compare(commands: Any) -> None:
+    compare = _command(
+        commands,
+        "compare",
+        _compare,
+        "environment steps, time, SP/XP and steps to equal quality of finished runs, against the number of agents",
+        "Runs of one method and environment are its seeds. Keys of --json: those of "
+        "popgen/evaluation/comparison_report.py (runs, costs, scores, quality, budgets, notes) and files.",
+    )
+    compare.add_argument(
+        "runs", nargs="*", type=_named_path, metavar="[NAME=]RUN", help="a run's folder, called NAME and not its method"
+    )
+    compare.add_argument(
+        *("--start", "-s"),
+        action="append",
+        type=_words,
+        default=[],
+        metavar="'KEY=VALUE ...'",
+        help="run this first (as `popgen run`), in DIR/runs, unless it is finished there; label=NAME calls it NAME",
+    )
+    compare.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="for every --start")
+    compare.add_argument("--agents", type=_at_least(1), default=8, help="extrapolate costs to this many (%(default)s)")
+    for name, which in (("--sp", "SP of at least"), ("--xp", "XP of at most")):
+        told = f"equal quality: {which} this (0.8 and 0.2 of the SP of the paper's XPM-WM on the layout)"
+        compare.add_argument(name, type=_finite, default=None, metavar="SCORE", help=told)
+    compare.add_argument("--out", default="comparison", metavar="DIR", help="of the report (%(default)s)")
+    compare.add_argument("--tracking-uri", default=None, metavar="URI", help="of MLflow (sqlite in DIR)")
+    compare.add_argument("--no-tracking", action="store_true", help="no MLflow")
+
+
+def _add_experiment(commands: Any) -> None:
+    experiment = commands.add_parser(
+        "experiment", help="an experiment of the paper", description="An experiment of the paper."
+    )
+    kinds = experiment.add_subparsers(title="experiments", metavar="WHICH", required=True, parser_class=_Parser)
+    sabotage = _command(
+        kinds,
+        "self-sabotage",
+        _self_sabotage,
+        "who leaves the task in cross-play: LIPO, CoMeDi and XPM-Sim on rendezvous, beside the paper's first table",
+        "Without --population all three are trained, 8 agents each, in DIR/runs (what is finished there is not trained "
+        "again); overrides are those of `popgen run`. Keys of --json: those of popgen/evaluation/sabotage_report.py "
+        "(rows, means, paper, steps, ...) and files.",
+    )
+    sabotage.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings of what is trained")
+    sabotage.add_argument(
+        "--population",
+        type=_label_and_path,
+        action="append",
+        default=[],
+        metavar="METHOD=PATH",
+        help="a finished population or run",
+    )
+    methods = ("lipo", "comedi", "xpm_sim", "mappo")
+    sabotage.add_argument("--method", action="append", choices=methods, help="what to train (the paper's three)")
+    sabotage.add_argument(
+        "--termination",
+        choices=("penalty", "plain", "both"),
+        default="both",
+        help="what an exit costs in training: the worst reward for every step left, nothing, or both (%(default)s)",
+    )
+    sabotage.add_argument("--seeds", type=_numbers, default=[1], metavar="1,2,...", help="of training (1)")
+    sabotage.add_argument("--episodes", type=_at_least(1), default=20, help="per ordered pair (%(default)s)")
+    sabotage.add_argument("--seed", type=_at_least(0), default=0, help="of the evaluation (%(default)s)")
+    sabotage.add_argument("--out", default="self-sabotage", metavar="DIR", help="of the report (%(default)s)")
 
 
 def _command(
@@ -446,6 +730,38 @@ def _positive(text: str) -> float:
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
     return value
+
+
+def _words(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"cannot read {text!r} ({error})") from None
+
+
+def _finite(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
+    return value
+
+
+def _named_path(text: str) -> tuple[str | None, str]:
+    """NAME=PATH, or a path alone; a name holds no slash."""
+    name, equals, path = text.partition("=")
+    if not equals or "/" in name:
+        return None, text
+    return _label_and_path(text)
+
+
+def _label_and_path(text: str) -> tuple[str, str]:
+    name, _, path = text.partition("=")
+    if not name or not path or "/" in name or len(name) > 40:
+        raise argparse.ArgumentTypeError(f"must be NAME=PATH with a short name without slashes, got {text!r}")
+    return name, path
 
 
 def _numbers(text: str) -> list[int]:

@@ -8,6 +8,20 @@ from pathlib import PurePath
 from typing import Any
 
 
+def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """`object_pairs_hook` of `json.loads`: readers differ in which of two equal keys they take.
+
+    Raises:
+        ValueError: a key stands twice.
+    """
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"key {key!r} stands twice")
+        found[key] = value
+    return found
+
+
 def jsonable(value: Any) -> Any:
     """`value` with numpy numbers and arrays as plain ones, tuples as lists, keys and paths as text.
 

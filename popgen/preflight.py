@@ -20,6 +20,9 @@ from popgen.tracking import check_uri
 MARGIN = 256 * 2**20
 """Bytes of disk beside buffers and weights: MLflow's file, logs, plots."""
 
+MOST_EPISODES = 1_000_000
+"""Of an evaluation."""
+
 _RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -29,7 +32,7 @@ def preflight(config: RunConfig) -> None:
     Raises:
         UserError: an environment that cannot be built or pays nothing for events, a view it does not have, windows or
             buffers of a size that does not fit it, a population to start from that is not of this environment, an
-            unsafe run id, a root that cannot be written, or too little disk or memory.
+            unsafe run id, a root that cannot be written or would not stay, or too little disk or memory.
     """
     spec = _build(config)
     check_run_id(config.run.id)
@@ -39,11 +42,52 @@ def preflight(config: RunConfig) -> None:
         _check_lengths(config, spec)
         check_cluster(config.cluster)
         check_memory(config, spec)
+        check_store(config, spec)
+    if "ppo" in config.relevant():
+        check_baseline(config, spec)
     if config.tracking.enabled:
         check_uri(config.tracking.uri)
     if config.population.init_from is not None:
         _check_start(config, spec)
+    check_evaluation(config)
+    check_storage(config.run.storage)
+    check_kept(Path(config.run.root))
     check_root(Path(config.run.root), disk_bytes(config, spec))
+
+
+def check_baseline(config: RunConfig, spec: EnvSpec) -> None:
+    """What RLlib's MAPPO needs: the view, CoMeDi's order, and a core's share for each remote runner."""
+    ppo, cluster = config.ppo, config.cluster
+    if ppo.view not in spec.views:
+        raise UserError("ppo.view", f"{spec.name} has no view {ppo.view!r}", f"choose one of {', '.join(spec.views)}")
+    if config.method == "comedi" and config.diversity.order != "sequential":
+        raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")
+    needed, have = ppo.runners * cluster.sampler_cpus, cluster.num_cpus
+    if cluster.address is None and have is not None and have < needed:
+        raise UserError("cluster.num_cpus", f"{have}, but the runners ask for {needed:g}", "raise it or ask for less")
+
+
+def check_evaluation(config: RunConfig) -> None:
+    """The final evaluation plays every ordered pair, and holds the figures of all its episodes."""
+    episodes = config.population.size**2 * config.evaluation.episodes
+    if episodes > MOST_EPISODES:
+        problem = (
+            f"{config.evaluation.episodes:,} for each of {config.population.size**2:,} pairs is {episodes:,} episodes"
+        )
+        raise UserError("evaluation.episodes", problem, f"keep them to {MOST_EPISODES:,} in all")
+
+
+def check_kept(root: Path) -> None:
+    """A run in the working directory that `ray job submit` uploads would be deleted with it, when the job has ended."""
+    if any(part.startswith("_ray_pkg_") for part in root.absolute().parts):
+        problem = f"{root} lies in the job's working directory, which Ray deletes"
+        raise UserError("run.root", problem, "give an absolute path on storage that stays, shared by all nodes")
+
+
+def check_storage(uri: str | None) -> None:
+    """A URI; whether it can be reached is seen when the run opens it."""
+    if uri is not None and not re.match(r"[A-Za-z][A-Za-z0-9+.-]*://.", uri):
+        raise UserError("run.storage", f"{uri!r} is no URI", "give one such as s3://bucket/path or file:///path")
 
 
 def check_run_id(name: str | None) -> None:
@@ -69,13 +113,35 @@ def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Both buffers must fit into this machine's memory; a cluster's nodes are not looked at."""
+    """Both buffers and the object store must fit into this machine's memory; a cluster's nodes are not looked at."""
     if config.cluster.address is not None:
         return
-    needed, have = buffer_bytes(config, spec), memory_bytes()
+    store = config.cluster.object_store_bytes or 0
+    needed, have = buffer_bytes(config, spec) + store, memory_bytes()
     if needed > have:
-        problem = f"{config.replay.capacity:,} steps need about {_gib(needed)}, this machine has {_gib(have)}"
+        told = f" and an object store of {_gib(store)}" if store else ""
+        problem = f"{config.replay.capacity:,} steps{told} need about {_gib(needed)}, this machine has {_gib(have)}"
         raise UserError("replay.capacity", problem, "lower it")
+
+
+def store_bytes(config: RunConfig, spec: EnvSpec) -> int:
+    """Bytes that are in a node's object store at most.
+
+    Both whole buffers on their way to a checkpoint; of each sampler, two calls' segments (states twice, rewards and
+    marks); and a margin for weights and start states.
+    """
+    state = spec.state_size * np.dtype(spec.state_dtype).itemsize
+    row = 2 * state + spec.num_players * (1 + spec.num_events) + 10
+    steps = config.phase1.envs * max(400, config.phase1.steps_per_iteration)
+    return buffer_bytes(config, spec) + 2 * steps * row + MARGIN
+
+
+def check_store(config: RunConfig, spec: EnvSpec) -> None:
+    """An object store of a given size must hold what is in it at a time."""
+    given, needed = config.cluster.object_store_bytes, store_bytes(config, spec)
+    if given is not None and given < needed:
+        problem = f"{given:,} bytes, but {needed:,} may be in it at a time"
+        raise UserError("cluster.object_store_bytes", problem, "raise it or lower replay.capacity")
 
 
 def check_cluster(cluster: ClusterConfig) -> None:
@@ -121,7 +187,8 @@ def _build(config: RunConfig) -> EnvSpec:
         unknown = re.search(r"unexpected keyword argument '(\w+)'", error.problem)
         if unknown:
             problem = f"{config.env.name} has no such parameter"
-            raise UserError(f"env.params.{unknown[1]}", problem, error.fix) from None
+            fix = "leave it out, or choose the environment by its group, env=NAME, which gives what it needs"
+            raise UserError(f"env.params.{unknown[1]}", problem, fix) from None
         name = error.field.removeprefix("env.")
         field = f"env.params.{name}" if name in config.env.params else "env.name" if name == "layout" else error.field
         raise UserError(field, error.problem, error.fix) from None

@@ -46,8 +46,9 @@ def check_uri(uri: str | None, timeout: float = 5.0) -> None:
     """
     if uri is None:
         return
-    scheme = uri.partition(":")[0].partition("+")[0].lower()
-    if scheme not in _SCHEMES:
+    scheme, _, place = uri.partition("://")
+    scheme = scheme.partition("+")[0].lower()
+    if scheme not in _SCHEMES or not place.strip("/"):
         raise UserError("tracking.uri", f"cannot track to {uri!r}", f"use null or one of {'://, '.join(_SCHEMES)}://")
     if scheme not in ("http", "https"):
         return
@@ -91,6 +92,8 @@ class Tracker:
         self._runs: dict[str, str] = dict((resume or {}).get("runs", {}))
         self._points: dict[str, list[Any]] = {}
         self._client: Any = None
+        self._monitor: Any = None
+        self._resumed = resume is not None
         self._experiment = ""
         if config.enabled:
             self._open(params or {})
@@ -99,13 +102,16 @@ class Tracker:
     def enabled(self) -> bool:
         return self._client is not None
 
-    def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
-        """Buffer metrics at `step`, of the population (member None) or of one member's nested run."""
+    def log(self, metrics: Mapping[str, float], step: int, member: int | None = None, when: int | None = None) -> None:
+        """Buffer metrics at `step`, of the population (member None) or of one member's nested run.
+
+        when: milliseconds since 1970, now if None. The same point given twice with the same time is kept once.
+        """
         if not self.enabled:
             return
         from mlflow.entities import Metric
 
-        now = int(time.time() * 1000)
+        now = int(time.time() * 1000) if when is None else when
         points = self._points.setdefault(self._run(member), [])
         points += [Metric(name, float(value), now, int(step)) for name, value in metrics.items()]
         if len(points) >= BATCH:
@@ -141,6 +147,8 @@ class Tracker:
         """Flush and end all runs with an MLflow status: FINISHED, FAILED or KILLED."""
         if not self.enabled:
             return
+        if self._monitor is not None:
+            self._monitor.finish()
         self.flush()
         for run in reversed(self._runs.values()):
             self._try(lambda run=run: self._client.set_terminated(run, status=status))
@@ -166,6 +174,15 @@ class Tracker:
             self._try(lambda: self._client.update_run(parent, status="RUNNING"))
         else:
             self._log_params(parent, params)
+        if self.config.system_metrics:
+            self._watch_system(parent)
+
+    def _watch_system(self, run: str) -> None:
+        from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+
+        logging.getLogger("mlflow.system_metrics").setLevel(logging.ERROR)
+        self._monitor = SystemMetricsMonitor(run, resume_logging=self._resumed, tracking_uri=self.uri)
+        self._monitor.start()
 
     def _find_experiment(self) -> str:
         from mlflow.exceptions import MlflowException
@@ -185,6 +202,8 @@ class Tracker:
     def _run(self, member: int | None) -> str:
         """MLflow id of the parent run or of a member's nested run, made when first needed."""
         key = "parent" if member is None else f"member_{member:03d}"
+        if key not in self._runs and self._resumed and (found := self._search(member)):
+            self._runs[key] = found
         if key not in self._runs:
             tags = {"popgen.run": self.run_name}
             if member is not None:
@@ -192,6 +211,14 @@ class Tracker:
             name = self.run_name if member is None else f"{self.run_name}/{key}"
             self._runs[key] = self._client.create_run(self._experiment, tags=tags, run_name=name).info.run_id
         return self._runs[key]
+
+    def _search(self, member: int | None) -> str | None:
+        """A run that an earlier tracker made, and died before anybody learned of it."""
+        tags = f"tags.`popgen.run` = '{self.run_name}'"
+        if member is not None:
+            tags += f" and tags.`popgen.member` = '{member}'"
+        found = self._client.search_runs([self._experiment], tags, order_by=["attributes.start_time DESC"])
+        return next((r.info.run_id for r in found if ("popgen.member" in r.data.tags) == (member is not None)), None)
 
     def _log_params(self, run: str, params: Mapping[str, Any]) -> None:
         from mlflow.entities import Param

@@ -1,7 +1,11 @@
-"""Nested state (dictionaries of arrays and plain values) as one safetensors and one JSON file; never pickled."""
+"""Nested state (dictionaries of arrays and plain values) as one safetensors and one JSON file; never pickled.
+
+values.json holds the digests of both parts, so that a damaged bit is noticed and not trained on.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -9,11 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import load_file, save
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from popgen.errors import UserError
 
 ARRAYS, VALUES = "arrays.safetensors", "values.json"
+FORMAT = 2
+"""Format 1 had no digests: its values.json is the state itself."""
 
 
 def save_state(folder: str | Path, state: dict[str, Any]) -> None:
@@ -30,9 +37,12 @@ def save_state(folder: str | Path, state: dict[str, Any]) -> None:
     values = _split(state, "", arrays)
     try:
         # Not safetensors' own writer, whose errors tell nothing of the disk.
-        for name, data in ((ARRAYS, save(arrays)), (VALUES, json.dumps(values).encode())):
+        data = save(arrays)
+        digests = {"arrays": _sha256(data), "values": _sha256(_text(values))}
+        document = {"format": FORMAT, "sha256": digests, "values": values}
+        for name, content in ((ARRAYS, data), (VALUES, _text(document))):
             with open(fresh / name, "wb") as file:
-                file.write(data)
+                file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
     except OSError:
@@ -50,22 +60,39 @@ def load_state(folder: str | Path) -> dict[str, Any]:
     """Read what `save_state` wrote.
 
     Raises:
-        UserError: missing or damaged files.
+        UserError: missing or damaged files, or those of another version.
     """
     folder = Path(folder)
     whole = folder if folder.exists() else _old(folder)
     try:
-        arrays = load_file(str(whole / ARRAYS))
-        state = _merge(json.loads((whole / VALUES).read_text()), arrays)
+        data = (whole / ARRAYS).read_bytes()
+        state = _merge(_checked(json.loads((whole / VALUES).read_text()), data), load(data))
         if not isinstance(state, dict):
             raise ValueError(f"{VALUES} holds no dictionary")
         return state
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
         raise UserError(str(folder), f"unreadable checkpoint ({error})", "remove it or start a new run") from None
-    except Exception as error:  # safetensors raises its own type, which it does not export in all versions
-        if type(error).__module__.startswith("safetensors"):
-            raise UserError(str(folder), f"damaged checkpoint ({error})", "remove it or start a new run") from None
-        raise
+
+
+def _checked(document: Any, data: bytes) -> Any:
+    """The values of a document whose digests are right."""
+    if not isinstance(document, dict) or "format" not in document or "sha256" not in document:
+        return document  # format 1
+    if document["format"] != FORMAT:
+        raise ValueError(f"of format {document['format']!r}, this version reads {FORMAT}")
+    values = document["values"]
+    for name, content in (("arrays", data), ("values", _text(values))):
+        if document["sha256"][name] != _sha256(content):
+            raise ValueError(f"its {name} are not what was written")
+    return values
+
+
+def _text(values: Any) -> bytes:
+    return json.dumps(values).encode()
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def _old(folder: Path) -> Path:

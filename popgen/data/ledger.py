@@ -29,8 +29,7 @@ class Ledger:
         path: of the file, made with its folder at the first flush; None keeps the ledger in memory.
 
     Raises:
-        UserError: the file holds something other than ledger entries.
-        LedgerConflict: the file holds one key with two different entries.
+        UserError: the file holds something other than ledger entries, or one key with two different entries.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -179,11 +178,10 @@ class Ledger:
             os.truncate(path, whole)
         for number, line in enumerate(data[:whole].splitlines(), start=1):
             try:
-                entry = _entry(json.loads(line))
-            except (ValueError, TypeError, KeyError) as error:
+                self._keep(_entry(json.loads(line)))
+            except (ValueError, TypeError, KeyError, RecursionError, LedgerConflict) as error:
                 fix = "restore the file from a copy, or start a new run"
                 raise UserError("ledger", f"{path} line {number} is no ledger entry ({error})", fix) from None
-            self._keep(entry)
 
 
 def _line(entry: LedgerEntry) -> str:
@@ -191,9 +189,13 @@ def _line(entry: LedgerEntry) -> str:
 
 
 _FIELDS = {field.name for field in fields(LedgerEntry)}
+_TYPES = {"run": str, "member": int, "sampler": str, "sequence": int, "steps": int, "episodes": int, "score": float}
 
 
 def _entry(values: dict[str, Any]) -> LedgerEntry:
     if not isinstance(values, dict) or set(values) != _FIELDS:
         raise ValueError(f"expected the fields {', '.join(sorted(_FIELDS))}")
+    for name, kind in _TYPES.items():
+        if type(values[name]) is not kind and not (kind is float and type(values[name]) is int):
+            raise ValueError(f"{name} is {values[name]!r:.100}")
     return LedgerEntry(**{**values, "kind": Kind(values["kind"])})

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -25,7 +27,8 @@ def save_segments(path: Path, segments: list[Segment], owner: int) -> None:
         for name in _ARRAYS
     }
     marks = [[str(s.kind), list(s.members), s.sampler, s.sequence] for s in segments]
-    data = save(arrays, metadata={"owner": str(owner), "segments": json.dumps(marks)})
+    said = {"owner": str(owner), "segments": json.dumps(marks)}
+    data = save(arrays, metadata={**said, "sha256": _digest(arrays, said)})
     with open(path, "wb") as file:
         file.write(data)
         file.flush()
@@ -41,12 +44,15 @@ def load_segments(path: Path) -> tuple[list[Segment], int]:
     try:
         with safe_open(str(path), "numpy") as file:
             metadata = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
+            if metadata.get("sha256", _digest(arrays, metadata)) != _digest(arrays, metadata):
+                raise ValueError("they are not what was written")
             marks = json.loads(metadata["segments"])
             segments = [
                 Segment(
                     Kind(kind),
                     (int(members[0]), int(members[1])),
-                    **{name: file.get_tensor(f"{number}.{name}") for name in _ARRAYS},
+                    **{name: arrays[f"{number}.{name}"] for name in _ARRAYS},
                     sampler=sampler,
                     sequence=int(sequence),
                 )
@@ -55,3 +61,12 @@ def load_segments(path: Path) -> tuple[list[Segment], int]:
             return segments, int(metadata["owner"])
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise UserError(str(path), f"unreadable segments ({error})", "remove checkpoints/progress") from None
+
+
+def _digest(arrays: Mapping[str, np.ndarray], said: Mapping[str, str]) -> str:
+    """sha256 of the marks and, by name, of the arrays."""
+    digest = hashlib.sha256(f"{said['owner']} {said['segments']}".encode())
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(arrays[name]).data)
+    return digest.hexdigest()

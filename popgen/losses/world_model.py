@@ -66,6 +66,5 @@ def event_counts(logits: Tensor, target: Tensor, mask: Tensor) -> dict[str, Tens
     chosen = mask.bool()
     predicted, actual = (logits > 0.0)[chosen].float(), target[chosen]
     total = {"hits": predicted * actual, "predicted": predicted, "actual": actual}
-    return {
-        name: value.sum(dim=(0, 1)) if value.numel() else torch.zeros(target.shape[-1]) for name, value in total.items()
-    }
+    none = torch.zeros(target.shape[-1], device=target.device)
+    return {name: value.sum(dim=(0, 1)) if value.numel() else none for name, value in total.items()}

@@ -17,9 +17,13 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from popgen.errors import UserError
+from popgen.jsonable import unique
 
 TEMPORARY = ".writing-"
 """Prefix of files and folders that are not finished; readers never look at them."""
+
+LARGEST = 2**31
+"""Bytes of a file that is read: members are megabytes, and a file is held in memory to check its sum."""
 
 _PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")  # torch.save's archive, and bare pickles
 
@@ -116,13 +120,16 @@ def remove_unfinished(folder: Path) -> None:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a regular file; UserError if it is missing or cannot be read."""
+    """Content of a regular file; UserError if it is missing, too large or cannot be read."""
+    fix = "restore the population from a good copy"
     try:
         if path.exists() and not path.is_file():
-            raise UserError(str(path), "is not a regular file", "restore the population from a good copy")
+            raise UserError(str(path), "is not a regular file", fix)
+        if path.exists() and path.stat().st_size > LARGEST:
+            raise UserError(str(path), f"is larger than {LARGEST / 2**30:g} GiB", fix)
         return path.read_bytes()
     except FileNotFoundError:
-        raise UserError(str(path), "is missing", "restore the population from a good copy") from None
+        raise UserError(str(path), "is missing", fix) from None
     except OSError as error:
         raise UserError(str(path), f"cannot be read: {error.strerror}", "check the path and its permissions") from error
 
@@ -130,7 +137,7 @@ def read_bytes(path: Path) -> bytes:
 def parse_json(path: Path, data: bytes) -> Any:
     """The JSON value in `data`, read from `path`; UserError if it is not JSON."""
     try:
-        return json.loads(data.decode())
+        return json.loads(data.decode(), object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         raise UserError(str(path), f"is not valid JSON: {error}", "restore the population from a good copy") from None
 

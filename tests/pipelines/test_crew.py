@@ -29,6 +29,24 @@ def test_actors_that_would_wait_for_ever_are_refused(asked: dict, told: str) -> 
         crew.check_resources(ClusterConfig(**asked), HAVE)
 
 
+@pytest.mark.parametrize(
+    ("asked", "field"),
+    [
+        ({}, ""),
+        ({"model_gpus": 1.0}, ""),
+        ({"agent_cpus": 5.0}, "cluster.agent_cpus: no node has 5 CPU;"),
+        ({"model_cpus": 2.0, "model_gpus": 1.0}, "cluster.model_cpus: no node has 2 CPU and 1 GPU;"),
+        ({"resources": {"tpu": 1.0}}, "cluster.sampler_cpus: no node has 0.1 CPU and 1 tpu;"),
+    ],
+)
+def test_every_actor_needs_a_node_to_fit_on(asked: dict, field: str) -> None:
+    nodes = [{"CPU": 4.0}, {"CPU": 1.0, "GPU": 1.0}]
+    if not field:
+        return crew.check_nodes(ClusterConfig(**asked), nodes)
+    with pytest.raises(UserError, match=field):
+        crew.check_nodes(ClusterConfig(**asked), nodes)
+
+
 def test_a_cluster_that_does_not_answer_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def nobody(**_: object) -> None:
         raise ConnectionError("Could not find any running Ray instance.")

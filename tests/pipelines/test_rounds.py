@@ -136,3 +136,36 @@ def test_nothing_is_at_work_while_saving(scripted: Scripted, schedule: str) -> N
     )
     assert done == log.finished == log.started and len(saved) == 3
     assert saved == [2, 4, 6] if schedule == "sync" else saved[0] >= 2
+
+
+def test_a_learner_need_not_wait_for_another_but_samplers_do(scripted: Scripted) -> None:
+    """`c` is the slowest: the learner `b` goes on, up to three rounds for each of the samplers', `a` is held back."""
+    scripted.slow = "c"
+    log = Log(4, scripted)
+    pace = rounds.Pace(log.work(), learners=("b", "c"), overlap=3)
+    ahead, may_start = {"a": 0, "b": 0}, pace.may_start
+
+    def watched(name: str) -> bool:
+        for kind in ahead:
+            ahead[kind] = max(ahead[kind], pace.done[kind] - pace.done["c"])
+        return may_start(name)
+
+    pace.may_start = watched  # type: ignore[method-assign]
+    done = rounds.run_rounds(log.work(), stop=lambda: log.rounds >= 4, after=log.after, schedule="async", pace=pace)
+    assert done == log.finished == log.started
+    assert ahead["a"] == rounds.AHEAD + 1 and ahead["b"] > ahead["a"]
+    assert done["b"] <= 3 * (done["a"] + 1)
+
+
+def test_staleness_is_what_ended_meanwhile() -> None:
+    pace = rounds.Pace("abc")
+    pace.started("a")
+    for _ in range(2):
+        pace.started("b")
+        pace.ended("b")
+    pace.started("c")
+    pace.ended("a")
+    pace.ended("c")
+    assert pace.staleness == {"a": 2, "b": 0, "c": 1}
+    figures = pace.figures()
+    assert figures["staleness/a"] == 2.0 and figures["queue/b"] == 1.0 and figures["queue/a"] == 0.0

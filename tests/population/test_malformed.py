@@ -108,6 +108,16 @@ CASES: dict[str, tuple[Callable[[Path], object], str, str]] = {
     ),
     "manifest not text": (lambda root: (root / "manifest.json").write_bytes(b"\xff\xfe\x00"), "manifest.json", "JSON"),
     "manifest nested": (lambda root: (root / "manifest.json").write_text("[" * 100_000), "manifest.json", "JSON"),
+    "manifest with a key twice": (
+        lambda root: (root / "manifest.json").write_text(
+            (root / "manifest.json").read_text().replace("{", '{"seed": 1, ', 1)
+        ),
+        "manifest.json", "key 'seed' stands twice",
+    ),
+    "manifest a device": (
+        lambda root: ((root / "manifest.json").unlink(), (root / "manifest.json").symlink_to("/dev/zero")),
+        "manifest.json", "is not a regular file",
+    ),
     "manifest of something else": (
         lambda root: (root / "manifest.json").write_text("[]"), "manifest.json", "not the manifest"
     ),
@@ -162,6 +172,18 @@ CASES: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "weights are a folder": (folder_for_weights, "member_001/policy.safetensors", "is not a regular file"),
     "weights cut": (
         lambda root: os.truncate(root / "member_001" / POLICY, 100), "member_001/policy.safetensors", "truncated"
+    ),
+    "weights of a hundred gigabytes": (
+        lambda root: os.truncate(root / "member_001" / POLICY, 100 * 2**30),
+        "member_001/policy.safetensors", "is larger than 2 GiB",
+    ),
+    "weights a link to themselves": (
+        lambda root: ((root / "member_001" / POLICY).unlink(), (root / "member_001" / POLICY).symlink_to(POLICY)),
+        "member_001/policy.safetensors", "cannot be read",
+    ),
+    "weights a link to nowhere": (
+        lambda root: ((root / "member_001" / POLICY).unlink(), (root / "member_001" / POLICY).symlink_to("gone")),
+        "member_001/policy.safetensors", "is missing",
     ),
     "weights empty": (
         lambda root: os.truncate(root / "member_001" / POLICY, 0), "member_001/policy.safetensors", "truncated"

@@ -29,10 +29,11 @@ SELF = 0
 """Key of the self-play critic among the critics; cross-play critics are keyed by partner."""
 
 
-def rollout_dtype(precision: str) -> torch.dtype:
-    """`auto` takes bfloat16 where the processor multiplies it natively, which is several times faster, else float32."""
+def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) -> torch.dtype:  # noqa: B008
+    """`auto` takes bfloat16 where the device multiplies it natively, which is several times faster, else float32."""
     if precision == "auto":
-        native = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+        cpu = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+        native = torch.cuda.is_bf16_supported if device.type == "cuda" else cpu
         precision = "bfloat16" if native() else "float32"
     return getattr(torch, precision)
 
@@ -40,17 +41,25 @@ def rollout_dtype(precision: str) -> torch.dtype:
 class AgentLearner:
     """Actor, one self-play critic and one cross-play critic per partner of member `member`.
 
-    Set the world model, start states and partners, then call `update`.
+    Set the world model, start states and partners, then call `update`. All tensors are on `device`; weights come and
+    go as arrays. What the generators give differs between kinds of devices, initial weights do not.
     """
 
     def __init__(
-        self, config: AgentConfig, model_config: WorldModelConfig, spec: EnvSpec, member: int, seed: int
+        self,
+        config: AgentConfig,
+        model_config: WorldModelConfig,
+        spec: EnvSpec,
+        member: int,
+        seed: int,
+        device: str | torch.device = "cpu",
     ) -> None:
         self.config, self.model_config, self.spec, self.member = config, model_config, spec, member
-        self.dtype = rollout_dtype(config.precision)
-        self.generator = torch.Generator().manual_seed(seed + 1)
+        self.device = torch.device(device)
+        self.dtype = rollout_dtype(config.precision, self.device)
+        self.generator = torch.Generator(self.device).manual_seed(seed + 1)
         self.rng = np.random.default_rng(seed + 2)
-        self.model = WorldModel(model_config, spec).to(self.dtype).eval().requires_grad_(False)
+        self.model = WorldModel(model_config, spec).to(self.device, self.dtype).eval().requires_grad_(False)
         self.partners: dict[int, Actor] = {}
         self.starts: Starts | None = None
         self.new_share = 0.0
@@ -61,9 +70,9 @@ class AgentLearner:
     def restart(self, seed: int) -> None:
         """Fresh actor, critics and return scale: the world model stays."""
         torch.manual_seed(seed)
-        self.actor = Actor(self.config, self.model_config, self.spec.num_actions)
+        self.actor = Actor(self.config, self.model_config, self.spec.num_actions).to(self.device)
         self.critics = torch.nn.ModuleDict()
-        self.scale = ReturnScale(self.config.return_percentiles)
+        self.scale = ReturnScale(self.config.return_percentiles).to(self.device)
         self._add_critic(SELF)
         for partner in self.partners:
             self._add_critic(partner)
@@ -72,7 +81,7 @@ class AgentLearner:
         self.updates = 0
 
     def _add_critic(self, key: int) -> None:
-        self.critics[str(key)] = Critic(self.config, self.model_config)
+        self.critics[str(key)] = Critic(self.config, self.model_config).to(self.device)
 
     def _make_optimisers(self) -> None:
         self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), lr=self.config.actor_lr, eps=1e-8)
@@ -83,7 +92,7 @@ class AgentLearner:
         """A frozen predecessor, with a critic of its own; it acts on the current world model's latents."""
         actor = Actor(self.config, self.model_config, self.spec.num_actions)
         w.load_weights(actor, actor_weights)
-        self.partners[member] = actor.to(self.dtype).eval().requires_grad_(False)
+        self.partners[member] = actor.to(self.device, self.dtype).eval().requires_grad_(False)
         self._add_critic(member)
         self.slow = copy.deepcopy(self.critics).requires_grad_(False)
         self._make_optimisers()
@@ -117,7 +126,7 @@ class AgentLearner:
         partner = self.choose_partner()
         imagined, seats = self._imagine(partner)
         sp_rows = self.config.starts_sp
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype is torch.bfloat16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16):
             actor_loss, critic_loss, metrics = self._self_play_losses(_rows(imagined, slice(None, sp_rows)))
             if partner is not None:
                 cross = _rows(imagined, slice(sp_rows, None))
@@ -132,8 +141,8 @@ class AgentLearner:
 
     def _start_rows(self, rows: np.ndarray) -> Latent:
         starts = self.starts
-        z = from_indices(torch.from_numpy(starts.z[rows]), self.model_config.classes).flatten(-2)
-        return Latent(torch.from_numpy(starts.h[rows]).to(self.dtype), z.to(self.dtype))
+        z = from_indices(torch.from_numpy(starts.z[rows]).to(self.device), self.model_config.classes).flatten(-2)
+        return Latent(torch.from_numpy(starts.h[rows]).to(self.device, self.dtype), z.to(self.dtype))
 
     def lambda_now(self) -> float:
         """lambda_XP of this update: rising from `lambda_start`, if that is less, to `lambda_xp` over
@@ -156,10 +165,10 @@ class AgentLearner:
         if count:
             only = partner if config.xp_starts == "partner" else None
             rows = np.concatenate([rows, draw_cross_play(self.starts, count, self.new_share, only, self.rng)])
-        seats = (torch.arange(count) >= count // 2).long()
-        partner_rows = config.starts_sp + torch.arange(count)
+        order = torch.arange(count, device=self.device)
+        seats, partner_rows = (order >= count // 2).long(), config.starts_sp + order
         partner_actor = self.partners[partner] if count else None
-        both = torch.tensor([0, 1])
+        both = torch.tensor([0, 1], device=self.device)
 
         def act(latent: Latent) -> Tensor:
             pair = Latent(*(x.unsqueeze(-2).expand(*x.shape[:-1], 2, x.shape[-1]) for x in (latent.h, latent.z)))
@@ -187,12 +196,12 @@ class AgentLearner:
     def _self_play_losses(self, imagined: Imagined) -> tuple[Tensor, Tensor, dict[str, float]]:
         steps, batch = imagined.reward.shape
         latent = imagined.latent[:-1]
-        seat = torch.zeros(steps + 1, batch, dtype=torch.long)
+        seat = torch.zeros(steps + 1, batch, dtype=torch.long, device=self.device)
         returns, value = self._targets(imagined, SELF, seat)
         scale = self.scale.update(returns)
         advantage = signed_advantage(Kind.SP, returns - value[:-1], weight=1.0, scale=scale)
         pair = Latent(*(x.unsqueeze(2).expand(*x.shape[:2], 2, x.shape[-1]) for x in (latent.h, latent.z)))
-        both = torch.tensor([0, 1]).expand(steps, batch, 2)
+        both = torch.tensor([0, 1], device=self.device).expand(steps, batch, 2)
         log_prob, entropy = self._policy_terms(pair, both, imagined.actions)
         running = imagined.running.unsqueeze(-1)
         actor_loss = reinforce(log_prob, advantage.unsqueeze(-1), entropy, running, entropy_scale=self.config.entropy)

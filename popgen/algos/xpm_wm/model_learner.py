@@ -34,35 +34,36 @@ class Batch:
 
     @staticmethod
     def of(windows: Windows, model: WorldModel) -> Batch:
-        """Batch-first arrays -> time-first tensors, observations scaled."""
+        """Batch-first arrays -> time-first tensors on the model's device, observations scaled."""
+        device = next(model.parameters()).device
 
         def tensor(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array)).transpose(0, 1)
+            return torch.from_numpy(np.ascontiguousarray(array)).to(device).transpose(0, 1)
 
-        cross = torch.from_numpy(windows.kind == KIND_CODE[Kind.XP])
+        cross = torch.from_numpy(windows.kind == KIND_CODE[Kind.XP]).to(device)
         return Batch(
             obs=model.filter.scaled(tensor(windows.obs)),
             actions=tensor(windows.actions),
             events=tensor(windows.events).float(),
             is_first=tensor(windows.is_first),
             terminal=tensor(windows.terminal).float(),
-            partner=torch.from_numpy(windows.partner),
+            partner=torch.from_numpy(windows.partner).to(device),
             cross=cross,
         )
 
 
 class ModelLearner:
-    """Owns the world model and its optimiser.
+    """Owns the world model and its optimiser, on `device`; weights and start states come and go as arrays.
 
     `predecessors` are the filters that earlier members left behind; they do not train.
     """
 
-    def __init__(self, config: WorldModelConfig, spec: EnvSpec, seed: int) -> None:
+    def __init__(self, config: WorldModelConfig, spec: EnvSpec, seed: int, device: str | torch.device = "cpu") -> None:
         torch.manual_seed(seed)
-        self.config, self.spec = config, spec
-        self.model = WorldModel(config, spec)
+        self.config, self.spec, self.device = config, spec, torch.device(device)
+        self.model = WorldModel(config, spec).to(self.device)
         self.optimiser = torch.optim.Adam(self.model.parameters(), lr=config.learning_rate, eps=1e-8)
-        self.generator = torch.Generator().manual_seed(seed + 1)
+        self.generator = torch.Generator(self.device).manual_seed(seed + 1)
         self.rng = np.random.default_rng(seed + 2)
         self.predecessors: dict[int, LatentFilter] = {}
         self.updates = 0
@@ -77,7 +78,7 @@ class ModelLearner:
 
     def add_predecessor(self, member: int, filter_weights: w.Weights) -> None:
         """Keep member's archived filter q_{theta^k} for the KL term of equation WM+."""
-        archived = LatentFilter(self.config, self.spec)
+        archived = LatentFilter(self.config, self.spec).to(self.device)
         w.load_weights(archived, filter_weights)
         self.predecessors[member] = archived.eval().requires_grad_(False)
 
@@ -108,7 +109,7 @@ class ModelLearner:
         return terms, seen, extras
 
     def _predecessor_loss(self, batch: Batch, seen: Observed) -> Tensor:
-        total = torch.zeros(())
+        total = torch.zeros((), device=self.device)
         if not self.config.kl_predecessors or not self.predecessors:
             return total
         latest = max(self.predecessors)
@@ -172,9 +173,10 @@ class ModelLearner:
         steps, rows = np.nonzero(allowed)
         picked = self.rng.integers(0, len(steps), size=count)
         t, b = steps[picked], rows[picked]
-        z = to_indices(self.model.filter.grouped(seen.latent.z[t, b].detach()))
+        z = to_indices(self.model.filter.grouped(seen.latent.z[t, b].detach())).cpu()
         partner = windows.partner[b].astype(np.int16)
-        return Starts(seen.latent.h[t, b].detach().float().numpy(), z.numpy(), np.full(count, pool, np.uint8), partner)
+        h = seen.latent.h[t, b].detach().float().cpu().numpy()
+        return Starts(h, z.numpy(), np.full(count, pool, np.uint8), partner)
 
     def state(self) -> dict[str, Any]:
         """Weights, optimiser and generators, to go on from exactly here."""

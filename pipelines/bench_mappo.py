@@ -1,0 +1,72 @@
+"""How fast MAPPO trains, end to end, and what the time goes to."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import ray
+
+from actors.common import build_env, settle
+from pipelines.crew import start_ray
+from popgen.config import RunConfig
+from popgen.rllib.algorithm import MappoConfig
+from popgen.rllib.job import Job
+
+
+def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
+    """Train self-play by the config's recipe for a while; nothing is written.
+
+    Args:
+        config: a run of method=mappo.
+        seconds: time of the measurement, after one iteration that is not counted.
+
+    Returns:
+        env, threads, runners, envs, iterations, steps; seconds and cpu_seconds (of this process and its threads) that
+        they took; steps_per_second, steps_per_cpu_second; shares of the time: sampling, pooling (advantages and
+        minibatches), gradients (forward, backward, optimiser), rllib (all else that happens in an iteration).
+
+    Raises:
+        UserError: no Ray answers.
+    """
+    settle(config.cluster.threads)
+    spec = build_env(config.env, 1).spec
+    job = Job(config.env, config.ppo, None, (1,), seed=config.run.seed)
+    mine = start_ray(config.cluster)
+    try:
+        algorithm = MappoConfig.of(job, spec, config.cluster).build_algo()
+        try:
+            measured = _train(algorithm, seconds)
+        finally:
+            algorithm.stop()
+    finally:
+        if mine:
+            ray.shutdown()
+    ppo = config.ppo
+    about = {"env": spec.name, "threads": config.cluster.threads, "runners": ppo.runners, "envs": ppo.envs}
+    return about | measured
+
+
+def _train(algorithm: Any, seconds: float) -> dict[str, Any]:
+    algorithm.train()
+    spent = {"sampling": 0.0, "pooling": 0.0, "gradients": 0.0}
+    steps = iterations = 0
+    began, cpu = time.perf_counter(), time.process_time()
+    while (passed := time.perf_counter() - began) < seconds:
+        algorithm.train()
+        iterations += 1
+        steps += sum(counted.steps for counted in algorithm.report.counted)
+        for name in spent:
+            spent[name] += algorithm.report.seconds[name]
+    used = time.process_time() - cpu
+    shares = {name: round(value / passed, 3) for name, value in spent.items()}
+    shares["rllib"] = round(1.0 - sum(spent.values()) / passed, 3)
+    return {
+        "iterations": iterations,
+        "steps": steps,
+        "seconds": round(passed, 2),
+        "cpu_seconds": round(used, 2),
+        "steps_per_second": round(steps / passed),
+        "steps_per_cpu_second": round(steps / used),
+        "shares": shares,
+    }
