@@ -28,7 +28,7 @@ need_token() {
 }
 
 answers() { # URL
-    python -c 'import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5).close()' "$1" 2>/dev/null
+    python -c 'import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=8).close()' "$1" 2>/dev/null
 }
 
 health() {

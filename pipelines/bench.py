@@ -13,6 +13,8 @@ import numpy as np
 
 from popgen.envs import BatchedEnv, make_env
 from popgen.envs.registry import env_names
+from popgen.errors import UserError
+from popgen.preflight import memory_bytes
 
 ROUND = 64  # joint actions drawn beforehand, and steps between two looks at the clock
 
@@ -31,8 +33,9 @@ def bench_env(name: str, *, num_envs: int = 1024, seconds: float = 2.0) -> dict[
         ratio: both None where there is none. All in environment steps a second.
 
     Raises:
-        UserError: an unknown environment.
+        UserError: an unknown environment, or more of them than fit into this machine's memory.
     """
+    _check_memory(name, num_envs)
     env = make_env(name, num_envs)
     actions = np.random.default_rng(0).integers(0, env.spec.num_actions, (ROUND, num_envs, env.spec.num_players))
     actions = actions.astype(np.uint8)
@@ -52,6 +55,17 @@ def bench_env(name: str, *, num_envs: int = 1024, seconds: float = 2.0) -> dict[
         "reference_steps_per_second": None if reference is None else round(reference),
         "ratio": None if reference is None else round(with_views / reference, 1),
     }
+
+
+def _check_memory(name: str, num_envs: int) -> None:
+    """Told before anything is allocated: the system would hand out more than there is, and run out of it later."""
+    spec = make_env(name, 1).spec
+    views = sum(math.prod(view.shape) * np.dtype(view.dtype).itemsize for view in spec.views.values())
+    each = spec.state_size * np.dtype(spec.state_dtype).itemsize + spec.num_players * (views + ROUND)
+    needed, have = num_envs * each, memory_bytes()
+    if needed > have:
+        problem = f"{num_envs:,} need about {needed / 2**30:.1f} GiB of memory, this machine has {have / 2**30:.1f}"
+        raise UserError("--envs", problem, "lower it")
 
 
 def _rate(play: Callable[[], None], steps: int, seconds: float) -> float:

@@ -148,12 +148,14 @@ class _Job:
         return result | {"seconds": round(time.time() - self.began, 1)}
 
     def _go_on(self, lost: str, spent: int) -> None:
-        """Other books, on a cluster that has room; a local Ray that lost its node, or fails again, starts anew."""
+        """Other books, on a cluster that has room. A local Ray that lost its node starts anew; so does, after a second
+        death at the same place, any connection that this job has made."""
         self.reporter.note(f"{lost}: going on from the last checkpoint")
         self.books.events.write("lost", level="WARNING", text=lost)
         self.books.give_over(RuntimeError(lost))
         tracker = self.books.tracker
-        if self.mine and (spent > 1 or not nodes_alive()):
+        local = self.config.cluster.address is None
+        if self.mine and (spent > 1 or local and not nodes_alive()):
             tracker.forget()
             ray.shutdown()
             self._start_ray()

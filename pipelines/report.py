@@ -15,7 +15,7 @@ def training_curves(metrics: Path) -> dict[str, tuple[list[float], list[float]]]
     Steps only grow: of points that a resumed run gave again, the last ones count.
     """
     curves: dict[str, tuple[list[float], list[float]]] = {}
-    names = {"real_sp": "SP", "real_xp_max": "strongest XP"}
+    names = {"real_sp": "SP", "real_xp_max": "strongest XP", "real_xp": "strongest XP"}
     for line in metrics.read_text().splitlines():
         row = json.loads(line)
         for field, label in names.items():

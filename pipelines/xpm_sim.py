@@ -103,11 +103,12 @@ class XpmSim:
         }
         books.add_member(policy, critics, seed=trainer.seed, extra=extra)
         self.members[member] = trainer.acting
-        self.reporter.note(
-            f"member {member}: SP {trainer.figures['sp']:.2f}, strongest XP {trainer.figures.get('xp', math.nan):.2f} "
-            f"{self.spec.score_name} in training, from XP states {figures.get('restart_ratio', math.nan):.2f} of SP, "
-            f"{trainer.steps:,} real and {extra['simulated_steps']:,} simulated steps, {seconds / 60:.1f} min"
-        )
+        ratio, seen = figures.get("restart_ratio"), trainer.figures
+        told = [f"SP {seen['sp']:.2f}"] + ([f"strongest XP {seen['xp']:.2f}"] if "xp" in seen else [])
+        told[-1] += f" {self.spec.score_name} in training"
+        told += [f"from XP states {ratio:.2f} of SP"] if ratio is not None else []
+        told += [f"{trainer.steps:,} real and {extra['simulated_steps']:,} simulated steps", f"{seconds / 60:.1f} min"]
+        self.reporter.note(f"member {member}: {', '.join(told)}")
 
     def _resume(self) -> tuple[int, dict[str, Any] | None]:
         """Finished members of this run, and the running one's last checkpoint; work behind neither is done again."""
@@ -141,7 +142,7 @@ class Member:
         self.pairs = [pair for k in order.tolist() for pair in ((member, k), (k, member))]
         self.returns = PartnerReturns(self.config.partner)
         self.figures: dict[str, float] = {}
-        self.round = self.updates = self.steps = 0
+        self.round = self.updates = self.trained = self.steps = 0
         self.acting: Weights = {}
 
     def train(self, saved: dict[str, Any] | None) -> None:
@@ -185,6 +186,7 @@ class Member:
 
     def _play(self) -> None:
         """One episode in each environment; its states go into the buffers, its steps into the ledger."""
+        self.trained = self.updates
         driver, crew, seed = self.driver, self.driver.crew, self.seed * 1000 + self.round
         teams = self._teams()
         weights = {**driver.members, self.member: self.acting}
@@ -229,7 +231,7 @@ class Member:
         """Figures of the round's real episodes, and what the policy that played them had been trained with."""
         simulated = self.driver.books.ledger.steps(member=self.member, kind=Kind.SIMULATED)
         return {f"real_{k}": v for k, v in self.figures.items()} | {
-            "updates": float(self.updates),
+            "updates": float(self.trained),
             "simulated_steps": float(simulated),
         }
 

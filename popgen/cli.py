@@ -225,12 +225,9 @@ def _runs(args: argparse.Namespace) -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    starts = []
-    for words in args.start:
-        label = next((word.partition("=")[2] for word in words if word.startswith("label=")), None)
-        overrides = [word for word in words if not word.startswith("label=")]
-        starts.append((label, _started([*overrides, *args.set], Path(args.out) / "runs")))
-    _check_started([config for _, config in starts], args.out)
+    labels = [next((w.partition("=")[2] for w in words if w.startswith("label=")), None) for words in args.start]
+    overrides = [[*(word for word in words if not word.startswith("label=")), *args.set] for words in args.start]
+    configs = _to_start(overrides, args.out)
     from pipelines.compare import EXPERIMENT, compare_runs
     from popgen.config import TrackingConfig
     from popgen.evaluation.comparison_report import to_tables
@@ -242,7 +239,7 @@ def _compare(args: argparse.Namespace) -> int:
     reporter = make_reporter(quiet=args.quiet)
     try:
         report = compare_runs(
-            *(args.runs, starts, args.out),
+            *(args.runs, list(zip(labels, configs, strict=True)), args.out),
             agents=args.agents,
             sp=args.sp,
             xp=args.xp,
@@ -269,21 +266,14 @@ def _self_sabotage(args: argparse.Namespace) -> int:
     rules = list(TERMINATIONS) if args.termination == "both" else [args.termination]
     base = [] if any(word.startswith("env=") for word in args.overrides) else ["env=rendezvous/mppmr"]
     base += ["population.size=8", *args.overrides]
-    configs = [
-        _started(
-            [
-                *base,
-                f"method={method}",
-                f"env.params.exit_penalty={TERMINATIONS[rule]['exit_penalty']}",
-                f"seed={seed}",
-            ],
-            Path(args.out) / "runs",
-        )
-        for rule in rules
+    penalties = [f"env.params.exit_penalty={TERMINATIONS[rule]['exit_penalty']}" for rule in rules]
+    overrides = [
+        [*base, f"method={method}", penalty, f"seed={seed}"]
+        for penalty in penalties
         for method in methods
         for seed in args.seeds
     ]
-    _check_started(configs, args.out)
+    configs = _to_start(overrides, args.out)
     from pipelines.experiments import self_sabotage
     from popgen.progress import make_reporter
 
@@ -303,25 +293,49 @@ def _self_sabotage(args: argparse.Namespace) -> int:
     return OK
 
 
-def _started(overrides: Sequence[str], root: Path) -> RunConfig:
-    """A run for a command that starts several: in a folder under `root` that its settings decide."""
-    from pipelines.batch import named
+def _shared_encoder(args: argparse.Namespace) -> int:
+    if args.overrides and args.run:
+        raise UserError("overrides", "have no use where nothing is trained", "leave out --run")
+    base = [] if any(word.startswith("env=") for word in args.overrides) else ["env=rendezvous/mppmr"]
+    base += ["method=xpm_sim", "population.size=8", *args.overrides]
+    kinds = [] if args.run else ["none", "shared"]
+    overrides = [[*base, f"xpm_sim.encoder={kind}", f"seed={seed}"] for seed in args.seeds for kind in kinds]
+    configs = _to_start(overrides, args.out)
+    from pipelines.shared_encoder import shared_encoder
+    from popgen.evaluation.shared_encoder import summary
+    from popgen.progress import make_reporter
+
+    reporter = make_reporter(quiet=args.quiet)
+    try:
+        report = shared_encoder(args.run, configs, args.out, reporter=reporter)
+    finally:
+        reporter.close()
+    if args.json:
+        _print_json(report)
+        return OK
+    print("\n".join([*summary(report), f"report: {args.out} ({', '.join(report['files'])})"]))
+    return OK
+
+
+def _to_start(overrides: Sequence[Sequence[str]], out: str) -> list[RunConfig]:
+    """The runs that a command starts itself, in folders under `out` that their settings decide.
+
+    All that can be known before the first of them starts is checked, and the place of the report.
+    """
     from popgen.config import RunConfig
-
-    return named(RunConfig.parse(compose(overrides)), root)
-
-
-def _check_started(configs: Sequence[RunConfig], out: str) -> None:
-    """Everything that can be known before the first of them starts, and the place of the report."""
-    from pipelines.batch import check_different
     from popgen.preflight import check_root, preflight
 
+    configs = [RunConfig.parse(compose(words)) for words in overrides]
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _bound_threads(max((config.cluster.threads for config in configs), default=1))
+    from pipelines.batch import check_different, named
+
+    configs = [named(config, Path(out) / "runs") for config in configs]
     check_different(configs)
     for config in configs:
         preflight(config)
     check_root(Path(out), 16 * 2**20, "--out")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    _bound_threads(max((config.cluster.threads for config in configs), default=1))
+    return configs
 
 
 def _bench(args: argparse.Namespace) -> int:
@@ -583,11 +597,12 @@ def _add_run(commands: Any) -> None:
         "run",
         _run,
         "generate a population",
-        "Overrides are Hydra's: a group as in env=overcooked/cramped_room, scale=laptop, cluster=gpu_node or "
-        "tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for run.seed=1. "
-        "Keys of --json: run_id, run_dir and population (paths), members (how many), matrix (mean and standard_error, "
-        "row = seat 0, column = seat 1), ledger (environment steps by member and kind), evaluation (as `evaluate "
-        "--json`), files (the report's), seconds; with --dry-run the whole configuration instead.",
+        "Overrides are Hydra's: a group as in env=overcooked/cramped_room, method=xpm_wm, scale=laptop, "
+        "cluster=gpu_node or tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for "
+        "run.seed=1. The same run.id goes on where an interrupted run was. Exit codes: 0, 2 for an error told in one "
+        "line, 130 when interrupted. Keys of --json: run_id, run_dir, population (paths), members (how many), matrix "
+        "(mean and standard_error, row = seat 0, column = seat 1), ledger (environment steps by member and kind), "
+        "evaluation (as `evaluate --json`), files (the report's), seconds; with --dry-run the whole configuration.",
     )
     run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
     run.add_argument("--dry-run", action="store_true", help="check everything, print the configuration, start nothing")
@@ -697,12 +712,27 @@ def _add_experiment(commands: Any) -> None:
     sabotage.add_argument("--episodes", type=_at_least(1), default=20, help="per ordered pair (%(default)s)")
     sabotage.add_argument("--seed", type=_at_least(0), default=0, help="of the evaluation (%(default)s)")
     sabotage.add_argument("--out", default="self-sabotage", metavar="DIR", help="of the report (%(default)s)")
+    encoder = _command(
+        kinds,
+        "shared-encoder",
+        _shared_encoder,
+        "learning curves of XPM-Sim's later members on rendezvous, with and without an encoder shared by all members",
+        "Without --run both kinds are trained, 8 agents each, in DIR/runs (what is finished there is not trained "
+        "again); overrides are those of `popgen run`. Keys of --json: those of popgen/evaluation/shared_encoder.py "
+        "(curves, environment, unit, runs) and files.",
+    )
+    encoder.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings of what is trained")
+    encoder.add_argument("--run", action="append", default=[], metavar="DIR", help="a finished run of either kind")
+    encoder.add_argument("--seeds", type=_numbers, default=[1], metavar="1,2,...", help="of training (1)")
+    encoder.add_argument("--out", default="shared-encoder", metavar="DIR", help="of the report (%(default)s)")
 
 
 def _command(
     commands: Any, name: str, command: Callable[[argparse.Namespace], int], summary: str, details: str
 ) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=summary + ".", epilog=details)
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.", epilog=details
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     parser.set_defaults(command=command)

@@ -45,6 +45,8 @@ def preflight(config: RunConfig) -> None:
         check_store(config, spec)
     if "ppo" in config.relevant():
         check_baseline(config, spec)
+    if config.method == "xpm_sim":
+        _check_simulation(config, spec)
     if config.tracking.enabled:
         check_uri(config.tracking.uri)
     if config.population.init_from is not None:
@@ -218,6 +220,15 @@ def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
     if config.replay.capacity < added:
         problem = f"cannot hold the {added:,} steps that phase2 adds at once"
         raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
+
+
+def _check_simulation(config: RunConfig, spec: EnvSpec) -> None:
+    """A round's real episodes must fit the buffers; where episodes end early each step can add a second row."""
+    given = config.xpm_sim
+    added = 2 * max(given.episodes_sp, given.episodes_xp) * spec.horizon
+    if given.capacity < added:
+        problem = f"may not hold the {added:,} rows that a round of real episodes adds"
+        raise UserError("xpm_sim.capacity", problem, "raise it or lower xpm_sim.episodes_sp and episodes_xp")
 
 
 def _check_start(config: RunConfig, spec: EnvSpec) -> None:

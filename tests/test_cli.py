@@ -82,6 +82,7 @@ BAD_OVERRIDES = {
     "missing interpolation": (["agent.lambda_xp=${nothing}"], "agent.lambda_xp"),
     "section replaced by a number": (["agent=3"], "agent"),
     "group replaced by a number": (["env=5"], "overcooked/cramped_room"),
+    "group replaced by a number beside a good one": (["env=5", "scale=smoke"], "env: there is no option '5'"),
     "group replaced by nothing": (["scale=null"], "choose one of demo, laptop, paper, smoke"),
     "no key": (["=5"], "KEY=VALUE"),
     "key without end": (["a" * 100_000 + "=1"], "aaa"),
@@ -377,6 +378,15 @@ def test_evaluate(run: Run, random_population: Path) -> None:
     assert all(Path(path).is_file() for path in result["files"].values()) and "json" in result["files"]
     code, out, err = run(*arguments, "--quiet")
     assert code == 0 and err == "" and "SP mean" in out and out.splitlines()[-1].startswith("report: report (")
+
+
+def test_a_layout_of_ones_own_is_measured_without_a_reference(run: Run) -> None:
+    Path("mine.layout").write_text('{\'grid\': """XXPXX\\nO1 2O\\nX   X\\nXDXSX"""}')
+    code, out, _ = run(
+        *("bench", "env", "--env", "overcooked/./mine.layout", "--envs", "2", "--seconds", "0.01", "--json")
+    )
+    told = json.loads(out)
+    assert code == 0 and told["steps_per_second"] > 0 and told["ratio"] is None
 
 
 def test_figures_that_are_not_finite_become_null(capsys: pytest.CaptureFixture[str]) -> None:

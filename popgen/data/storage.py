@@ -98,8 +98,12 @@ class Mirror:
         self._held = {PurePosixPath(info.path).name for info in found}
         document = self._latest()
         self._before = {digest for digest, _ in document["files"].values()} if document else set()
-        mark = self.folder / MARK
-        mark.with_suffix(".writing").write_text(json.dumps({"writer": self.writer}))
+        self._mark(self.folder, self.writer)
+
+    def _mark(self, folder: Path, writer: str) -> None:
+        """Note in the folder whose copy it is up to."""
+        mark = folder / MARK
+        mark.with_suffix(".writing").write_text(json.dumps({"writer": writer}))
         mark.with_suffix(".writing").replace(mark)
 
     def _send(self, path: Path, name: str) -> list[Any]:
@@ -150,8 +154,10 @@ class Mirror:
             return None
         fresh = self.folder.with_name(self.folder.name + ".restoring")
         shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir(parents=True)
         for name, (digest, _) in document["files"].items():
             self._fetch(fresh, name, digest)
+        self._mark(fresh, document["writer"])
         told = f"restored from {self.uri}"
         if self.folder.exists():
             aside = next(

@@ -2,8 +2,10 @@
 
     minimise  sum over kinds of  mean over that kind's rows of  surrogate(sign * weight * advantage / scale)
 
-A row is a step of one seat that the member's present policy played. The signs are those of `losses.diversity`; `scale`
-is the standard deviation of the self-play advantages, for every kind. Advantages of each kind are centred.
+A row is a step of one seat that the member's present policy played. The signs are those of `losses.diversity`.
+Advantages of each kind are centred; `scale` is their standard deviation or self-play's, whichever is larger. Divided by
+its own alone, cross-play would keep pushing with full weight when its returns are nearly zero; by self-play's alone, it
+would drown a beginner's self-play, whose returns are small beside what a trained partner earns.
 """
 
 from __future__ import annotations
@@ -207,7 +209,7 @@ def pool(
 
     Each critic takes its returns into its statistics.
     """
-    scale, parts, rows, figures = None, [], {}, {}
+    own, parts, rows, figures = None, [], {}, {}
     for kind, partner, weight in plan.sources(member):
         found, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
         if found is None or not bool(found.trained.any()):
@@ -216,17 +218,22 @@ def pool(
         advantage, returns = advantages(found, critic, view, discount=discount, lam=lam)
         counted = found.trained.any(-1)
         chosen = advantage[counted]
+        spread = chosen.std(correction=0).clamp(min=1e-6)
         if kind is Kind.SP:
-            scale = chosen.std().clamp(min=1e-6)
-        if scale is None:
+            own = spread
+        if own is None:
             return None
+        scale = torch.maximum(own, spread)
         centred = torch.zeros_like(advantage)
         centred[counted] = signed_advantage(kind, chosen - chosen.mean(), weight=weight, scale=scale)
         parts.append(_policy_rows(found, centred, kind))
         critic.see(returns[counted], value_decay)
         rows[name] = _critic_rows(found, critic, returns, counted, view)
         told = str(kind).lower()
-        figures |= {f"{told}_reward": float(found.reward[counted].mean()), f"{told}_advantage_std": float(chosen.std())}
+        figures |= {
+            f"{told}_reward": float(found.reward[counted].mean()),
+            f"{told}_advantage_std": float(chosen.std(correction=0)),
+        }
         figures[f"{told}_explained"] = _explained(advantage[counted], returns[counted])
     if not parts:
         return None
@@ -257,4 +264,4 @@ def _critic_rows(found: Trajectories, critic: ValueNet, returns: Tensor, counted
 
 def _explained(advantage: Tensor, returns: Tensor) -> float:
     """Share of the returns' variance that the critic knew before: their advantages are its errors."""
-    return float(1.0 - advantage.var() / returns.var().clamp(min=1e-8))
+    return float(1.0 - advantage.var(correction=0) / returns.var(correction=0).clamp(min=1e-8))

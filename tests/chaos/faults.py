@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
-from site_of_chaos import Site, end, events, until
+from site_of_chaos import FAR, Site, end, events, until
 
 ACTORS = {
     "sampler": {"xpm_wm": "SamplerActor", "xpm_sim": "SamplerActor", "default": "Runner"},
@@ -150,6 +150,9 @@ def signal_driver(number: signal.Signals) -> Callable[[Hit], None]:
 
 def kill_node(hit: Hit) -> None:
     """kill -9 of the node that all actors are on; another one comes."""
+    if hit.site.node is None:
+        hit.site.add_node()
+    hit.place = (f"cluster.address={hit.site.cluster.address}", f"cluster.resources.{FAR}=1")
     process = hit.start()
     if hit.reached(process):
         hit.site.remove_node()
@@ -255,7 +258,7 @@ FAULTS = {
         Fault("local raylet", kill_local_raylet),
         Fault("disk full", fill_disk(0), is_root, one_line=True),
         Fault("disk nearly full", fill_disk(64 * 2**20), is_root, one_line=True),
-        Fault("damaged checkpoint", damage_checkpoint),
+        Fault("damaged checkpoint", damage_checkpoint, lambda method: method.startswith("xpm")),
         Fault("machine lost", lose_machine),
     )
 }

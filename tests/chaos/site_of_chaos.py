@@ -1,4 +1,4 @@
-"""Where the campaign's runs take place: a Ray cluster of two nodes on this machine, and drivers as processes."""
+"""Where the campaign's runs take place: a Ray cluster on this machine, and drivers as processes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from popgen.data.ledger import Ledger
 from popgen.population import load_population
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-WORK = "work"
-"""Custom resource of the node that all actors run on; the head has none of it."""
+NEAR, FAR = "near", "far"
+"""Custom resources: of the head, where actors run, and of a second node, which is there when one is to be lost."""
 
 QUICK = {
     "health_check_initial_delay_ms": 2000,
@@ -58,27 +58,27 @@ class Site:
 
     folder: Path
     cluster: Cluster
-    node: Any
+    node: Any = None
     drivers: list[psutil.Process] = field(default_factory=list)
 
     @staticmethod
     def open() -> Site:
-        """Start the head and the node that works."""
-        os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")
+        """Start the head."""
         folder = Path(tempfile.mkdtemp(prefix="pg-chaos-", dir="/tmp"))  # Ray's sockets need a short path
-        arguments = {"num_cpus": 1, "_system_config": QUICK, "include_dashboard": False}
-        cluster = Cluster(initialize_head=True, head_node_args=arguments)
-        site = Site(folder, cluster, None)
-        site.add_node()
-        return site
+        # A folder of its own: another cluster's address, which Ray keeps in the usual one, stays what it is.
+        arguments = {"num_cpus": 4, "resources": {NEAR: 100}, "temp_dir": str(folder), "include_dashboard": False}
+        arguments["_system_config"] = QUICK
+        cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args=arguments))
+        return Site(folder, cluster)
 
     def add_node(self) -> None:
-        """Another node to work on."""
-        self.node = self.cluster.add_node(num_cpus=4, resources={WORK: 100})
+        """A second node."""
+        self.node = patiently(lambda: self.cluster.add_node(num_cpus=4, resources={FAR: 100}))
 
     def remove_node(self) -> None:
-        """kill -9 of all processes of the node."""
+        """kill -9 of all processes of the second node."""
         self.cluster.remove_node(self.node, allow_graceful=False)
+        self.node = None
 
     def close(self) -> None:
         """End everything that was started here."""
@@ -91,7 +91,7 @@ class Site:
 
     def overrides(self, run: str, *more: str, root: Path | None = None, place: tuple[str, ...] = ()) -> list[str]:
         """Of a small run, in this cluster if no other `place` is given."""
-        place = place or (f"cluster.address={self.cluster.address}", f"cluster.resources.{WORK}=1")
+        place = place or (f"cluster.address={self.cluster.address}", f"cluster.resources.{NEAR}=1")
         return [*SMOKE, *place, f"run.root={root or self.folder / 'runs'}", f"run.id={run}", *more]
 
     def start(self, overrides: list[str], log: Path) -> subprocess.Popen[bytes]:
@@ -127,6 +127,17 @@ class Site:
             if title.startswith("ray::") and not title.startswith("ray::IDLE") and re.search(pattern, title):
                 found.append(process)
         return sorted(found, key=lambda process: process.pid)
+
+
+def patiently(act: Callable[[], Any], tries: int = 4) -> Any:
+    """Ray gives its processes half a minute to start, which on a busy machine may be too short."""
+    for left in reversed(range(tries)):
+        try:
+            return act()
+        except Exception:  # Ray raises that very class
+            if not left:
+                raise
+    return None
 
 
 def end(process: psutil.Process, number: int = signal.SIGKILL) -> None:

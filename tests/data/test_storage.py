@@ -98,6 +98,7 @@ def test_another_machine_that_went_on_is_followed(tmp_path: Path, place: str) ->
     Mirror(here, place).push()
     other = Mirror(there, place)
     assert other.pull() is not None
+    assert Mirror(there, place).pull() is None  # nothing newer than what it has
     (there / "ledger.jsonl").write_text("two\n")
     other.push()
     told = Mirror(here, place).pull()

@@ -311,6 +311,6 @@ def test_the_entry_script_starts_the_other_roles(echoes: Path, tmp_path: Path) -
 
 
 def test_the_entry_script_says_that_nothing_answers() -> None:
-    free = {name: "9" for name in ("DASHBOARD_PORT", "AGENT_PORT", "MLFLOW_PORT")}  # the port of discard
+    free = dict.fromkeys(("DASHBOARD_PORT", "AGENT_PORT", "MLFLOW_PORT"), "9")  # the port of discard
     for role in ("head", "worker", "mlflow"):
         assert entry("health", role, **free).returncode == 1

@@ -9,9 +9,11 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import ray
 
@@ -21,8 +23,9 @@ from pipelines.population import driver_class, run_population
 from popgen.cli import compose
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
+from popgen.envs import make_env
 from popgen.errors import UserError
-from popgen.population import load_population
+from popgen.population import Population, load_population
 from popgen.preflight import preflight
 from popgen.progress import NullReporter
 from popgen.rllib.algorithm import Mappo as Algorithm
@@ -63,8 +66,28 @@ def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
     return RunConfig.parse(compose([*base, f"run.root={root}", f"run.id={name}", *overrides]))
 
 
-def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> tuple[dict[str, Any], Counter[tuple[int, str]]]:
-    """Run it; also what the algorithms said they stepped. The run dies at the N-th call of METHOD (`METHOD:N`)."""
+@dataclass
+class Run:
+    """A finished training: its folder, and what its algorithms said they stepped, by member and kind."""
+
+    dir: Path
+    said: Counter[tuple[int, str]]
+
+    @property
+    def population(self) -> Population:
+        return load_population(self.dir / "population")
+
+    def ledger(self) -> list[tuple[Any, ...]]:
+        """All entries, but for what tells attempts apart."""
+        return [(e.member, e.kind, e.sequence, e.steps, e.episodes, e.score) for e in Ledger(self.dir / "ledger.jsonl")]
+
+    def sha256s(self) -> list[str]:
+        return [info.policy_sha256 for info in self.population.members]
+
+
+def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Run:
+    """Train without the evaluation after it. It dies at the beginning of the N-th call of METHOD (`METHOD:N`)."""
+    config = smoke(root, name, *overrides)
     calls: Counter[str] = Counter()
     said: Counter[tuple[int, str]] = Counter()
 
@@ -94,59 +117,47 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> tuple[di
         patch.setattr(Algorithm, "train", train)
         patch.setattr(baselines, "save_state", save)
         patch.setattr(Books, "add_member", add)
-        return run_population(smoke(root, name, *overrides), reporter=NullReporter()), said
-
-
-def training(ledger: dict[str, dict[str, int]]) -> dict[tuple[int, str], int]:
-    """Steps by member and kind, without evaluation and totals."""
-    return {
-        (int(member), kind): steps
-        for member, row in ledger.items()
-        if member != "total"
-        for kind, steps in row.items()
-        if kind in ("SP", "XP", "MP") and steps
-    }
-
-
-def entries(folder: Path) -> list[tuple[Any, ...]]:
-    """The ledger, but for what tells attempts apart."""
-    return [(e.member, e.kind, e.sequence, e.steps, e.episodes, e.score) for e in Ledger(folder / "ledger.jsonl")]
-
-
-def sha256s(folder: Path) -> list[str]:
-    return [info.policy_sha256 for info in load_population(folder / "population").members]
+        spec = make_env(config.env.name, 1, **config.env.params).spec
+        books = Books(config, spec)
+        try:
+            driver_class(config.method)(config, spec, books, NullReporter()).run()
+        finally:
+            books.close("FINISHED")
+    return Run(books.dir, said)
 
 
 SIZES = {"mappo": "population.size=2", "lipo": "population.size=3", "comedi": "population.size=3"}
 
 
 @pytest.fixture(scope="module")
-def runs(root: Path) -> dict[str, tuple[dict[str, Any], Counter[tuple[int, str]]]]:
+def runs(root: Path) -> dict[str, Run]:
     return {method: launch(root, method, f"method={method}", size) for method, size in SIZES.items()}
 
 
 @pytest.mark.parametrize("method", SIZES)
-def test_the_ledger_holds_what_the_runners_stepped(method: str, runs: dict[str, Any]) -> None:
-    result, said = runs[method]
-    assert training(result["ledger"]) == dict(said)
-    info = load_population(result["population"]).members
-    for member in info:
-        row = {kind: steps for (owner, kind), steps in said.items() if owner == member.id}
+def test_the_ledger_holds_what_the_runners_stepped(method: str, runs: dict[str, Run]) -> None:
+    run = runs[method]
+    counted: Counter[tuple[int, str]] = Counter()
+    for entry in Ledger(run.dir / "ledger.jsonl"):
+        counted[entry.member, str(entry.kind)] += entry.steps
+    assert counted == run.said
+    for member in run.population.members:
+        row = {kind: steps for (owner, kind), steps in run.said.items() if owner == member.id}
         assert member.steps == row and row["SP"] == SP_STEPS and member.seed == 3000 + member.id
 
 
-def test_steps_by_kind(runs: dict[str, Any]) -> None:
+def test_steps_by_kind(runs: dict[str, Run]) -> None:
     """Cross-play has 4 environments with each partner, mixed play 4 with the strongest; CoMeDi chooses it by an
     episode with each partner in each seat at iterations 1 and 3."""
-    assert set(runs["mappo"][1]) == {(1, "SP"), (2, "SP")}
-    lipo, comedi = runs["lipo"][1], runs["comedi"][1]
+    assert set(runs["mappo"].said) == {(1, "SP"), (2, "SP")}
+    lipo, comedi = runs["lipo"].said, runs["comedi"].said
     assert [lipo[m, "XP"] for m in (1, 2, 3)] == [0, SP_STEPS, 2 * SP_STEPS]
     assert [comedi[m, "MP"] for m in (1, 2, 3)] == [0, SP_STEPS, SP_STEPS]
     fresh = 2 * 2 * HORIZON
     assert [comedi[m, "XP"] for m in (1, 2, 3)] == [0, SP_STEPS + fresh, SP_STEPS + 2 * fresh]
 
 
-def test_members_act_without_rllib(runs: dict[str, Any]) -> None:
+def test_members_act_without_rllib(runs: dict[str, Run]) -> None:
     """Loaded and played in a process that then holds neither Ray nor RLlib."""
     code = (
         "import sys, numpy as np, popgen\n"
@@ -158,60 +169,58 @@ def test_members_act_without_rllib(runs: dict[str, Any]) -> None:
         "    assert actions.shape == (4, 2)\n"
         "assert not {'ray', 'mlflow', 'hydra'} & set(sys.modules)\n"
     )
-    for method in ("lipo", "comedi"):
-        subprocess.run([sys.executable, "-c", code, runs[method][0]["population"]], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code, str(runs["lipo"].dir / "population")], check=True, timeout=240)
 
 
-def test_critics_are_kept_by_kind_and_partner(runs: dict[str, Any]) -> None:
+def test_critics_are_kept_by_kind_and_partner(runs: dict[str, Run]) -> None:
     expected = {
         "mappo": [{"SP"}, {"SP"}],
         "lipo": [{"SP", "XP_2", "XP_3"}, {"SP", "XP_1", "XP_3"}, {"SP", "XP_1", "XP_2"}],
         "comedi": [{"SP"}, {"SP", "XP_1", "MP_1"}, {"SP", "XP_1", "XP_2", "MP_1", "MP_2"}],
     }
     for method, names in expected.items():
-        population = load_population(runs[method][0]["population"])
-        assert [
-            {name.split(".")[1] for name in population.training(m) or {}} for m in range(1, len(names) + 1)
-        ] == names
+        tensors = [runs[method].population.training(m) or {} for m in range(1, len(names) + 1)]
+        assert [{name.split(".")[1] for name in found} for found in tensors] == names
 
 
-def test_members_differ(runs: dict[str, Any]) -> None:
-    for result, _ in runs.values():
-        found = sha256s(Path(result["run_dir"]))
+def test_members_differ(runs: dict[str, Run]) -> None:
+    for run in runs.values():
+        found = run.sha256s()
         assert len(set(found)) == len(found)
 
 
-def test_metrics_tell_what_training_did(runs: dict[str, Any]) -> None:
-    rows = [json.loads(line) for line in (Path(runs["comedi"][0]["run_dir"]) / "metrics.jsonl").open()]
+def test_metrics_tell_what_training_did(runs: dict[str, Run]) -> None:
+    rows = [json.loads(line) for line in (runs["comedi"].dir / "metrics.jsonl").open()]
     last = [row for row in rows if row["member"] == 3]
     wanted = {"ppo/entropy", "ppo/xp_reward", "ppo/mp_reward", "ppo/kl", "real_xp"}
     assert len(last) == 3 and wanted <= set().union(*last)
-    assert last[-1]["step"] == sum(steps for (m, _), steps in runs["comedi"][1].items() if m == 3)
+    assert last[-1]["step"] == sum(steps for (m, _), steps in runs["comedi"].said.items() if m == 3)
 
 
 def test_sequential_lipo_meets_its_predecessors_only(root: Path) -> None:
-    result, said = launch(root, "sequential", "method=lipo", "population.size=2", "diversity.order=sequential")
-    assert said == {(1, "SP"): SP_STEPS, (2, "SP"): SP_STEPS, (2, "XP"): SP_STEPS}
-    assert "XP_1" in str(load_population(result["population"]).training(2).keys())
+    run = launch(root, "sequential", "method=lipo", "population.size=2", "diversity.order=sequential")
+    assert run.said == {(1, "SP"): SP_STEPS, (2, "SP"): SP_STEPS, (2, "XP"): SP_STEPS}
+    assert "critics.XP_1.mean" in (run.population.training(2) or {})
 
 
-DEATHS = {
-    "mappo": ("train:2", "save:1", "save:4", "add:1", "added:1", "train:4"),
-    "lipo": ("train:3", "add:1", "added:1", "added:2"),
-    "comedi": ("train:5", "save:7", "added:2"),
-}
-"""Before an iteration; before its checkpoint is written; before and after a member is added."""
+def test_a_whole_run_is_evaluated(root: Path) -> None:
+    result = run_population(smoke(root, "whole", "method=lipo", "population.size=2"), reporter=NullReporter())
+    table = result["ledger"]
+    assert {kind: table["2"][kind] for kind in ("SP", "XP")} == {"SP": SP_STEPS, "XP": SP_STEPS}
+    assert table["2"]["evaluation"] > 0 and np.shape(result["matrix"]["mean"]) == (2, 2)
+
+
+DEATHS = {"mappo": ("train:2", "save:4", "added:1"), "lipo": ("train:3", "added:2"), "comedi": ("train:5", "save:7")}
+"""Before an iteration; before its checkpoint is written; before a member's; after a member was added."""
 
 
 @pytest.mark.parametrize(("method", "die_at"), [(m, at) for m, points in DEATHS.items() for at in points])
-def test_a_killed_run_ends_as_one_that_was_not(method: str, die_at: str, root: Path, runs: dict[str, Any]) -> None:
-    whole, name = Path(runs[method][0]["run_dir"]), f"{method}_{die_at.replace(':', '_')}"
+def test_a_killed_run_ends_as_one_that_was_not(method: str, die_at: str, root: Path, runs: dict[str, Run]) -> None:
+    whole, name = runs[method], f"{method}_{die_at.replace(':', '_')}"
     with pytest.raises(Killed):
         launch(root, name, f"method={method}", SIZES[method], die_at=die_at)
-    result, _ = launch(root, name, f"method={method}", SIZES[method])
-    assert sha256s(root / name) == sha256s(whole)
-    assert entries(root / name) == entries(whole)
-    assert training(result["ledger"]) == training(runs[method][0]["ledger"])
+    run = launch(root, name, f"method={method}", SIZES[method])
+    assert run.sha256s() == whole.sha256s() and run.ledger() == whole.ledger()
 
 
 def test_what_cannot_be_is_refused_before_anything_starts(root: Path) -> None:
@@ -231,3 +240,30 @@ def test_what_cannot_be_is_refused_before_anything_starts(root: Path) -> None:
 def test_every_method_has_its_driver() -> None:
     found = {method: driver_class(method) for method in SIZES}
     assert found == {"mappo": baselines.Mappo, "lipo": baselines.Lipo, "comedi": baselines.CoMeDi}
+
+
+PAPER = {
+    "overcooked/cramped_room": (6e6, 6e-4, 3e-3),
+    "overcooked/asymmetric_advantages": (6e6, 1e-3, 4e-3),
+    "overcooked/coordination_ring": (6e6, 8e-4, 5e-3),
+    "overcooked/forced_coordination": (6e6, 6e-4, 8e-3),
+    "overcooked/counter_circuit_o_1order": (6e6, 6e-4, 8e-3),
+    "rendezvous/mppmr": (8e5, 5e-4, 1e-4),
+}
+"""Environment -> steps, learning rate and entropy of the paper's tables."""
+
+
+@pytest.mark.parametrize("env", PAPER)
+def test_the_papers_numbers(env: str) -> None:
+    lipo = RunConfig.parse(compose(["method=lipo", "scale=paper", f"env={env}"]))
+    comedi = RunConfig.parse(compose(["method=comedi", "scale=paper", f"env={env}"]))
+    assert lipo.ppo == comedi.ppo and (lipo.ppo.max_steps, lipo.ppo.learning_rate, lipo.ppo.entropy) == PAPER[env]
+    assert (lipo.diversity.lambda_xp, comedi.diversity.lambda_xp, comedi.diversity.lambda_mp) == (0.25, 0.5, 0.25)
+    ppo, flat = lipo.ppo, env.startswith("rendezvous")
+    assert (ppo.units, ppo.layers, ppo.cnn_kernels, ppo.activation) == (
+        (512, 5, (), "leaky_relu") if flat else (512, 3, (5, 3, 3), "leaky_relu")
+    )
+    # As many fresh steps with each partner, in both seatings, as self-play has in an iteration.
+    horizon = make_env(lipo.env.name, 1, **lipo.env.params).spec.horizon
+    assert 2 * comedi.diversity.select_episodes * horizon == ppo.envs * ppo.steps
+    assert comedi.diversity.order == "sequential" and lipo.diversity.order == "concurrent"

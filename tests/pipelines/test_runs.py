@@ -86,7 +86,7 @@ def test_looking_at_a_run_does_not_end_its_lock(folder: Path, elsewhere: Any) ->
     ("status", "error", "state", "told"),
     [
         ("FINISHED", None, "finished", None),
-        ("FAILED", UserError("training", "loss is nan\n", "lower it"), "failed", "training: loss is nan; lower it"),
+        ("FAILED", UserError("training", "loss is\nnan", "lower it"), "failed", "training: loss is nan; lower it"),
         ("FAILED", RuntimeError(), "failed", "RuntimeError"),
         ("FAILED", RuntimeError("a\nb" + "x" * 1000), "failed", "a b" + "x" * 497),
         ("KILLED", KeyboardInterrupt(), "interrupted", "KeyboardInterrupt"),

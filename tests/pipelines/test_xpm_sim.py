@@ -6,7 +6,6 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +15,9 @@ import pytest
 import ray
 from local_crew import Handle
 
+from actors.common import build_env
 from actors.exact_learner import ExactLearnerActor
 from actors.sampler import SamplerActor
-from pipelines import population as main_job
 from pipelines import xpm_sim as pipeline
 from pipelines.books import Books
 from pipelines.checkpoints import Checkpoints
@@ -28,7 +27,9 @@ from pipelines.xpm_sim import Member
 from popgen.cli import compose
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
+from popgen.errors import UserError
 from popgen.population import load_population
+from popgen.preflight import preflight
 from popgen.progress import NullReporter
 from popgen.types import Kind
 
@@ -55,25 +56,22 @@ class LocalCrew(pipeline.Crew):
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[None]:
-    """A Ray of this module's own; its sockets need a short path."""
-    folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")
-    options = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
-    ray.init(address="local", num_cpus=2, _temp_dir=folder, **options)
-    yield
-    ray.shutdown()
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, cluster: None) -> Path:
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("runs")
 
 
-def launch(root: Path, name: str, *overrides: str, local: bool = True, die_at: str = "") -> Path:
-    """Run three members of two rounds; the run's folder. die_at: METHOD:N of the books or checkpoints, before it."""
+def configured(root: Path, name: str, *overrides: str) -> RunConfig:
+    """Three members of two rounds."""
     base = ["method=xpm_sim", "scale=smoke", "tracking=off", "population.size=3", f"env.params.horizon={HORIZON}"]
-    config = RunConfig.parse(compose([*base, "seed=3", f"run.root={root}", f"run.id={name}", *overrides]))
+    return RunConfig.parse(compose([*base, "seed=3", f"run.root={root}", f"run.id={name}", *overrides]))
+
+
+def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
+    """Train without Ray, objects in place of references; the run's folder.
+
+    die_at: METHOD:N of the books or checkpoints; the run dies before the N-th call of it.
+    """
+    config = configured(root, name, *overrides)
     method, _, number = die_at.partition(":")
     calls: Counter[str] = Counter()
 
@@ -88,16 +86,23 @@ def launch(root: Path, name: str, *overrides: str, local: bool = True, die_at: s
         return dying
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(main_job, "Books", mortal(mortal(mortal(Books, "record"), "record_steps"), "add_member"))
+        patch.setattr(ray, "get", lambda given: given)
+        patch.setattr(ray, "put", lambda given: given)
+        patch.setattr(pipeline, "Crew", LocalCrew)
         patch.setattr(pipeline, "Checkpoints", mortal(Checkpoints, "save"))
-        if local:
-            patch.setattr(pipeline, "Crew", LocalCrew)
-        return Path(run_population(config, reporter=NullReporter())["run_dir"])
+        kind = mortal(mortal(mortal(Books, "record"), "record_steps"), "add_member")
+        spec = build_env(config.env, 1).spec
+        books = kind(config, spec)
+        try:
+            pipeline.XpmSim(config, spec, books, NullReporter()).run()
+        finally:
+            books.close("FINISHED")
+    return root / name
 
 
 def ledger(run: Path) -> list[tuple[Any, ...]]:
-    """All entries, but for the run's name and what tells attempts apart: the key's sampler and sequence."""
-    entries = Ledger(run / "ledger.jsonl")
+    """Entries of training, but for the run's name and what tells attempts apart: the key's sampler and sequence."""
+    entries = [entry for entry in Ledger(run / "ledger.jsonl") if entry.kind is not Kind.EVALUATION]
     return [(e.member, e.kind, e.sampler.partition(".")[0], e.steps, e.episodes, e.score) for e in entries]
 
 
@@ -107,7 +112,7 @@ def weights(run: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(root: Path) -> Path:
-    return launch(root, "whole", local=False)
+    return launch(root, "whole")
 
 
 def test_every_step_is_counted_once_by_kind(whole: Path) -> None:
@@ -132,15 +137,30 @@ def test_members_act_and_their_figures_are_told(whole: Path) -> None:
     assert {name.split(".")[1] for name in population.training(3)} == {"self", "cross"}
     rows = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
     last = [row for row in rows if row["member"] == 3]
-    assert [row["updates"] for row in last if "updates" in row] == [2, 4]
+    assert [row["updates"] for row in last if "updates" in row] == [0, 2]
     assert {"real_sp", "real_xp", "learner/entropy", "learner/lambda", "simulated_steps"} <= last[1].keys()
+    played, columns = [row["simulated_steps"] for row in last[:2]], 12
+    assert played == [0, 10 * 2 * columns]  # before the updates that the row tells of
     assert "check/score_sp" in last[-1] and "check/score_restart" in last[-1]
 
 
-def test_a_run_without_processes_and_the_same_seed_give_the_same(whole: Path, root: Path) -> None:
-    again = launch(root, "again")
-    assert weights(again) == weights(whole)
-    assert ledger(again) == ledger(whole)
+def test_the_same_seed_gives_the_same_on_a_real_ray_too(whole: Path, root: Path) -> None:
+    folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")  # Ray's sockets need a short path
+    options = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
+    ray.init(address="local", num_cpus=2, _temp_dir=folder, **options)
+    try:
+        result = run_population(configured(root, "real"), reporter=NullReporter())
+    finally:
+        ray.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
+    real = Path(result["run_dir"])
+    assert weights(real) == weights(whole)
+    assert ledger(real) == ledger(whole)
+    assert result["members"] == 3 and result["ledger"]["total"]["simulated"] > 0
+    assert {"random", "idle"} == set(result["evaluation"]["beside"])
+
+
+def test_another_seed_gives_another_population(whole: Path, root: Path) -> None:
     other = launch(root, "other", "seed=4", "population.size=1")
     assert weights(other)[0] != weights(whole)[0]
 
@@ -157,7 +177,6 @@ def test_interrupted_anywhere_the_run_ends_the_same(whole: Path, root: Path, die
 
 def test_a_finished_run_called_again_trains_nothing(whole: Path, root: Path) -> None:
     shutil.copytree(whole, root / "copied")
-    shutil.rmtree(root / "copied" / "report")
     config = json.loads((root / "copied" / "config.json").read_text())
     config["run"]["id"] = "copied"
     (root / "copied" / "config.json").write_text(json.dumps(config))
@@ -200,3 +219,9 @@ def test_more_episodes_than_pairs_are_shared_evenly() -> None:
     teams = Member(driver(1, episodes_xp=5), 2)._teams()
     assert {team.members: team.envs for team in teams[1:]} == {(2, 1): 3, (1, 2): 2}
     assert len(Member(driver(0), 1)._teams()) == 1
+
+
+def test_buffers_that_cannot_hold_a_round_are_refused(root: Path) -> None:
+    with pytest.raises(UserError, match="80 rows"):  # 2 episodes of 20 steps, each of which may end one
+        preflight(configured(root, "refused", "xpm_sim.capacity=79"))
+    preflight(configured(root, "refused", "xpm_sim.capacity=80"))

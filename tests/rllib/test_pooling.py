@@ -8,6 +8,7 @@ import torch
 from rollouts import VIEW, mp, reads_observation, rollout, sp, xp
 from torch import Tensor
 
+from popgen.nets.feed_forward import ValueNet
 from popgen.rllib.pooling import Batch, Plan, Trajectories, advantages, gather, pool
 from popgen.types import Kind
 
@@ -64,9 +65,12 @@ def seats(seed: int) -> np.ndarray:
     return table
 
 
+def critics() -> dict[str, ValueNet]:
+    return {name: reads_observation() for name in ("SP", "XP_1", "XP_2", "MP_1")}
+
+
 def batch(plan: Plan, rollouts: list | None = None) -> Batch:
-    critics = {name: reads_observation() for name in ("SP", "XP_1", "XP_2", "MP_1")}
-    pooled = pool(rollouts or kinds(), 3, plan, critics, VIEW, **OPTIONS)
+    pooled = pool(rollouts or kinds(), 3, plan, critics(), VIEW, **OPTIONS)
     assert pooled is not None
     return pooled
 
@@ -80,16 +84,19 @@ def raw(kind: Kind, partner: int) -> tuple[Tensor, Trajectories]:
 
 def test_signs_weights_and_scales() -> None:
     """+(A - mean)/s in self-play, -lambda_XP (A - mean)/s in cross-play, +lambda_MP (A - mean)/s in mixed play, with
-    s the deviation of the self-play advantages for all three."""
+    s the deviation of that kind's advantages or of self-play's, whichever is larger."""
     pooled = batch(Plan(1, lambda_xp=0.5, lambda_mp=0.25))
     own, _ = raw(Kind.SP, 3)
-    expected, scale = [], own.std()
+    expected, scales = [], []
     for kind, partner, factor in ((Kind.SP, 3, 1.0), (Kind.XP, 1, -0.5), (Kind.MP, 1, 0.25)):
         advantage, found = raw(kind, partner)
         counted = found.trained.any(-1)
         centred = advantage - advantage[counted].mean()
+        scales.append(max(own.std(correction=0), advantage[counted].std(correction=0)))
+        scale = scales[-1]
         expected.append((factor * centred / scale).unsqueeze(-1).expand_as(found.trained)[found.trained])
     torch.testing.assert_close(pooled.advantage, torch.cat(expected))
+    assert scales[0] in scales[1:] and len(set(scales)) > 1  # both cases
     assert [len(part) for part in expected] == [6 * 8 * 2, 6 * 8, 2 * (4 + 1) * 2]
     assert pooled.cross.tolist() == [False] * 96 + [True] * 48 + [False] * 20
     for part in pooled.weight.split([96, 48, 20]):
@@ -188,3 +195,11 @@ def test_mixed_play_before_any_switch_is_left_out() -> None:
     table = rollout(3, sp(3), xp(3, 1), mp(1, 3))
     pooled = batch(Plan(1, 0.5, 0.25), [table])
     assert set(pooled.critics) == {"SP", "XP_1"}
+
+
+def test_a_single_step_after_the_switch_gives_finite_figures() -> None:
+    seats = np.broadcast_to(np.array([[3, 3]] * 4 + [[1, 3]] * 2), (3, 6, 2)).astype(np.int32).copy()
+    seats[2, 4] = 3
+    pooled = pool([rollout(3, sp(3), mp(1, 3), seats=seats)], 3, Plan(1, 0.0, 0.25), critics(), VIEW, **OPTIONS)
+    assert pooled is not None and len(pooled.critics["MP_1"].target) == 1
+    assert np.isfinite(list(pooled.figures.values())).all() and pooled.advantage[-2:].tolist() == [0.0, 0.0]

@@ -6,6 +6,7 @@ import numpy as np
 
 from popgen.algos.xpm_sim.learner import XpmSimLearner
 from popgen.data.replay import Replay
+from popgen.envs.reward import rewards_events
 
 
 def restart_check(learner: XpmSimLearner, pairs: int) -> tuple[dict[str, float], int]:
@@ -18,8 +19,8 @@ def restart_check(learner: XpmSimLearner, pairs: int) -> tuple[dict[str, float],
         pairs: of starts to compare.
 
     Returns:
-        score_restart and score_sp (mean score over those steps; without cross-play only the latter), their ratio
-        where scores cannot be negative, and the simulated steps that it took.
+        score_restart and score_sp (mean score over those steps; without cross-play only the latter), restart_ratio
+        where scores count something, and the simulated steps that it took.
     """
     length = max(1, learner.env.spec.horizon // 2)
     own, cross = (_by_time(learner, replay, length) for replay in (learner.starts.sp, learner.starts.xp))
@@ -33,7 +34,7 @@ def restart_check(learner: XpmSimLearner, pairs: int) -> tuple[dict[str, float],
             states = replay.states[[learner.rng.choice(rows[time]) for time in chosen]]
             score = learner.simulator.score(states, length, learner.actor.net)
             figures[name], steps = float(score.mean()), steps + pairs * length
-    if len(figures) == 2 and figures["score_sp"] > 0 and figures["score_restart"] >= 0:
+    if len(figures) == 2 and rewards_events(learner.env.spec) and figures["score_sp"] > 0:
         figures["restart_ratio"] = figures["score_restart"] / figures["score_sp"]
     return figures, steps
 

@@ -181,9 +181,9 @@ class XpmSimLearner:
         signed = signed_advantage(Kind.SP, advantage - advantage.mean(), weight=1.0, scale=spread)
         groups = []
         for columns, weight in ((layout.start, config.sp_weight), (layout.again, config.restart_weight)):
-            for seat in range(batch.actions.shape[-1]):  # every seat learns from the joint advantage
+            for seat in range(players := batch.actions.shape[-1]):  # every seat learns from the joint advantage
                 seats = torch.full((columns.stop - columns.start,), seat)
-                groups.append((Actions.of_seats(batch, columns, seats, signed[:, columns]), weight / 2.0))
+                groups.append((Actions.of_seats(batch, columns, seats, signed[:, columns]), weight / players))
         return groups, [lesson], {"advantage_sp": float(spread), "return_sp": float(lesson.returns.mean())}
 
     def _cross_play(self, batch: Batch, partner: int, spread: float) -> tuple[Group, Lesson, dict[str, float]]:
