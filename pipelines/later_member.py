@@ -62,7 +62,7 @@ class LaterMember:
     def rounds(self) -> int:
         """Rounds of real episodes at most: those configured, fewer where the environment steps end first."""
         phase = self.phase
-        most = max(phase.rounds, phase.max_rounds or 0)
+        most = max(phase.rounds, phase.max_rounds)
         each = (phase.episodes_sp + self.episodes_xp) * self.driver.spec.horizon
         return most if phase.max_steps is None else max(1, min(most, phase.max_steps // each))
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from popgen.config.base import Batch, Fraction, Layers, NonNegative, Number, Positive, Rate, Schema, Weight, Width, _Int
+from popgen.config.base import Batch, Fraction, Layers, NonNegative, Positive, Rate, Schema, Weight, Width, _Int
 from popgen.errors import UserError
 
 _Kernel = Annotated[_Int, Field(ge=1, le=31)]
@@ -46,8 +46,8 @@ class PpoConfig(Schema):
     grad_clip: Weight = 0.5
     value_weight: Weight = 1.0
     value_decay: Fraction = 0.9
-    max_steps: Positive = 1_000_000
-    target_score: Number | None = None
+    max_steps: Positive = 800_000
+    target_score: Weight = 10.5
     window: Positive = 64
 
     @model_validator(mode="after")
@@ -78,7 +78,7 @@ class DiversityConfig(Schema):
         of the others are not forgotten.
     window: episodes with a partner (both seatings) behind its return. CoMeDi instead plays `select_episodes` fresh
         episodes with each partner in each seating, every `select_every` iterations.
-    target_xp: see `ppo.target_score`; None for no early end.
+    target_xp: see `ppo.target_score`.
     """
 
     order: Literal["concurrent", "sequential"] = "concurrent"
@@ -92,4 +92,4 @@ class DiversityConfig(Schema):
     window: Positive = 32
     select_every: Positive = 5
     select_episodes: Batch = 2
-    target_xp: Number | None = None
+    target_xp: Weight = 2.0

@@ -174,7 +174,7 @@ class Phase2Config(Schema):
     episodes_sp: Batch = 8
     episodes_xp: Batch = 8
     rounds: Positive = 8
-    max_rounds: Positive | None = None  # for a member whose best self-play is below the target; None: no more
+    max_rounds: Positive = 9  # for a member whose best self-play is below the target
     target_score: Number = 8.0
     max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
     cache: Positive = 8192

@@ -173,13 +173,11 @@ class Mappo(PPO):
 
     def _reached(self, member: int) -> bool:
         ppo, diversity, scores = self.job.ppo, self.job.diversity, self.scores(member)
-        if ppo.target_score is None or len(self.own[member]) < ppo.window or scores["sp"] < ppo.target_score:
+        if len(self.own[member]) < ppo.window or scores["sp"] < ppo.target_score:
             return False
         partners = self.job.partners(member)
         if not partners or diversity is None:
             return True
-        if diversity.target_xp is None:
-            return False
         known = self.partners[member].mean_scores()
         return len(known) == len(partners) and max(known.values()) <= diversity.target_xp
 

@@ -83,7 +83,7 @@ def strike(
 ) -> dict[str, Any]:
     """One fault: the run, what hit it and when, and what came of it."""
     for attempt in range(TRIES):
-        name = f"{number:03d}-{fault.name}-{attempt}"
+        name = f"{number:03d}-{fault.name.replace(chr(32), chr(45))}-{attempt}"
         moment = rng.randrange(2, known["events"])
         hit = Hit(site, name, method, moment, rng.random() * fault.delay, rng)
         began = time.time()
@@ -94,7 +94,7 @@ def strike(
     row |= {"submissions": hit.submissions, "told": hit.told, "seconds": round(time.time() - began, 1)}
     run = hit.run
     if not hit.struck or hit.code:
-        problem = "not hit" if not hit.struck else f"exit {hit.code}: {hit.told}"
+        problem = f"{'hit' if hit.struck else 'not hit'}, exit {hit.code}: {hit.told}"
         return row | {"survived": False, "problem": problem, "attempts": 0, "repeated": 0}
     books, wanted = Books.of(run), known["books"]
     problems = [what for what in ("weights", "entries", "totals") if getattr(books, what) != getattr(wanted, what)]

@@ -188,7 +188,7 @@ def fill_disk(reserve: int) -> Callable[[Hit], None]:
                 hit.victim, hit.struck = "disk", True
                 fill(hit.root / "ballast", leave=reserve // 2)
             if hit.wait(process) == 2:
-                (hit.root / "ballast").unlink()
+                (hit.root / "ballast").unlink(missing_ok=True)
                 hit.wait(hit.start())
             else:
                 hit.struck = False  # it needed no more room

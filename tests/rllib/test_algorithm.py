@@ -23,7 +23,9 @@ from popgen.types import Kind
 
 HORIZON = 20
 ENV = EnvConfig(params={"horizon": HORIZON})
-PPO = PpoConfig(units=16, layers=1, envs=4, steps=10, epochs=1, minibatches=2, max_steps=400, window=4)
+PPO = PpoConfig(
+    units=16, layers=1, envs=4, steps=10, epochs=1, minibatches=2, max_steps=400, window=4, target_score=1e9
+)
 CROSS = DiversityConfig(xp_envs=4, mp_envs=2, warmup=4, select_every=2, select_episodes=3, partner_random=0.0)
 SPEC = make_env(ENV.name, 1, **ENV.params).spec
 SOLO = Job(ENV, PPO, None, (1,), seed=1)
@@ -173,8 +175,8 @@ def test_frozen_partners_do_not_move(comedi: Mappo) -> None:
 
 def ends(**values: Any) -> tuple[bool, ...]:
     """Whether a member with two partners is at its end, with these scores."""
-    diversity = CROSS.model_copy(update={"target_xp": values.get("target_xp")})
-    ppo = PPO.model_copy(update={"target_score": values.get("target")})
+    diversity = CROSS.model_copy(update={"target_xp": values.get("target_xp", 0.0)})
+    ppo = PPO.model_copy(update={"target_score": values.get("target", 1e9)})
     algorithm = Mappo.__new__(Mappo)
     algorithm.job = Job(ENV, ppo, diversity, (3,), seed=0, frozen={1: {}, 2: {}})
     algorithm.rounds = values.get("rounds", 1)
@@ -191,7 +193,7 @@ def test_training_ends_with_its_budget_or_its_targets() -> None:
     assert ends(**done)
     for change in ({"own": [5.0] * 3}, {"own": [4.9] * 4}, {"cross": [(1, 1.1), (2, 0.5)]}, {"cross": [(1, 1.0)]}):
         assert not ends(**(done | change))
-    assert not ends(**(done | {"target_xp": None})) and not ends(**(done | {"target": None}))
+    assert not ends(**(done | {"target_xp": 0.9})) and not ends(**(done | {"target": 5.1}))
 
 
 def test_an_algorithm_goes_on_from_its_snapshot(solo: Mappo, comedi: Mappo) -> None:

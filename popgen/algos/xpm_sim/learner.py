@@ -8,6 +8,7 @@ a mean of its own, so that its weight against lambda_XP does not depend on how m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -176,7 +177,7 @@ class XpmSimLearner:
             return self._joint(obs), torch.zeros(len(obs), 0)
 
         advantage, lesson = self._evaluate(batch, layout.both, SELF, inputs)
-        spread = advantage.std().clamp(min=1e-6)
+        spread = advantage[batch.valid[:, layout.both]].std().clamp(min=1e-6)
         # Centred as usual: a shift of all advantages only adds noise.
         signed = signed_advantage(Kind.SP, advantage - advantage.mean(), weight=1.0, scale=spread)
         groups = []
@@ -187,7 +188,7 @@ class XpmSimLearner:
         return groups, [lesson], {"advantage_sp": float(spread), "return_sp": float(lesson.returns.mean())}
 
     def _cross_play(self, batch: Batch, partner: int, spread: float) -> tuple[Group, Lesson, dict[str, float]]:
-        """The same for cross-play, whose advantages enter with -lambda_XP in units of self-play's spread."""
+        """The same for cross-play, whose advantages enter with -lambda_XP in units of self-play's spread, bounded."""
         shared, layout = self.config.xp_critic == "shared", batch.layout
         seats, eye = torch.from_numpy(layout.seats), torch.eye(self.env.spec.num_players)
         which = torch.eye(len(self.partners))[sorted(self.partners).index(partner)] if shared else torch.zeros(0)
@@ -199,8 +200,8 @@ class XpmSimLearner:
             return self._joint(both), torch.cat([eye[seat], which.expand(len(obs), -1)], -1)
 
         advantage, lesson = self._evaluate(batch, layout.cross, SHARED if shared else str(partner), inputs)
-        weight = self.lambda_now()
-        signed = signed_advantage(Kind.XP, advantage, weight=weight, scale=spread)
+        weight, bound = self.lambda_now(), spread * (self.config.xp_clip or math.inf)
+        signed = signed_advantage(Kind.XP, advantage.clamp(-bound, bound), weight=weight, scale=spread)
         figures = {
             "advantage_xp": float(advantage.std()),
             "return_xp": float(lesson.returns.mean()),
@@ -225,7 +226,8 @@ class XpmSimLearner:
         advantage, returns = advantages(batch, columns, value, discount=config.discount, lam=config.lam)
         time, count = returns.shape
         given = inputs(batch.obs[:, columns].flatten(0, 1), torch.arange(count).repeat(time))
-        return advantage, Lesson(key, *given, returns.flatten())
+        valid = batch.valid[:, columns].flatten()
+        return advantage, Lesson(key, *given, returns.flatten())[valid]
 
     # ---- losses --------------------------------------------------------------------------------------------------
 
@@ -290,8 +292,9 @@ class XpmSimLearner:
         figures = {}
         for name, columns in (("sp", layout.start), ("restart", layout.again), ("xp", layout.cross)):
             if columns.stop > columns.start:
-                figures[f"simulated_reward_{name}"] = float(batch.reward[:, columns].mean()) * horizon
-                figures[f"simulated_score_{name}"] = float(batch.score[:, columns].mean()) * horizon
+                valid = batch.valid[:, columns]
+                figures[f"simulated_reward_{name}"] = float(batch.reward[:, columns][valid].mean()) * horizon
+                figures[f"simulated_score_{name}"] = float(batch.score[:, columns][valid].mean()) * horizon
         return figures
 
     # ---- what is kept --------------------------------------------------------------------------------------------

@@ -32,10 +32,11 @@ class Actions:
 
     @staticmethod
     def of_seats(batch: Batch, columns: slice | Tensor, seats: Tensor, advantage: Tensor) -> Actions:
-        """What the member did in one seat of each of n columns; seats (n,), advantage (T, n)."""
+        """What the member did in one seat of each of n columns; seats (n,), advantage (T, n). Steps that belong to no
+        trajectory have no weight."""
         index = torch.arange(len(batch.actions[0]))[columns]
         columns_of = (seats.expand_as(advantage), batch.actions[:, index, seats], batch.log_prob[:, index, seats])
-        rows = (batch.obs[:, index, seats], *columns_of, advantage, torch.ones_like(advantage))
+        rows = (batch.obs[:, index, seats], *columns_of, advantage, batch.valid[:, columns].float())
         return Actions(*(x.flatten(0, 1) for x in rows))
 
     @staticmethod
@@ -56,7 +57,8 @@ def advantages(batch: Batch, columns: slice, value: Values, *, discount: float, 
     """GAE over some columns (paper, appendix D.1): advantages and returns, both (T, n).
 
     A trajectory that was cut, and the last row, bootstrap from the critic's value of the state they led to; no
-    advantage flows from a trajectory into the one before it in its column.
+    advantage flows from a trajectory into the one before it in its column. Advantages of steps that belong to no
+    trajectory are the mean of the others.
     """
     time, count = batch.reward.shape[0], columns.stop - columns.start
     obs = torch.cat([batch.obs[:, columns], batch.last_obs[None, columns]]).flatten(0, 1)
@@ -68,4 +70,5 @@ def advantages(batch: Batch, columns: slice, value: Values, *, discount: float, 
     mine = (column >= columns.start) & (column < columns.stop)
     reward[cut] += discount * value(batch.cut_obs[mine], column[mine] - columns.start)
     advantage = gae(reward, values, discount * going_on.float(), lam)
-    return advantage, advantage + values[:-1]
+    valid = batch.valid[:, columns]
+    return torch.where(valid, advantage, advantage[valid].mean()), advantage + values[:-1]

@@ -71,6 +71,7 @@ class Batch:
         terminated: (T, N) bool. cut: (T, N) bool, ended otherwise.
         cut_obs: (K, P, *view.shape) where the K cut trajectories ended, in row-major order of `cut`.
         last_obs: (N, P, *view.shape) after the last row.
+        valid: (T, N) bool, the step belongs to a trajectory; False while a column rests after its task terminated.
         trajectories: how many ended or were left at the end.
     """
 
@@ -84,6 +85,7 @@ class Batch:
     cut: Tensor
     cut_obs: Tensor
     last_obs: Tensor
+    valid: Tensor
     trajectories: int
 
     @property
@@ -113,6 +115,7 @@ class Simulator:
         log_prob = torch.empty(time, rows, spec.num_players)
         reward, score = np.empty((time, rows), np.float32), np.empty((time, rows), np.float32)
         terminated, cut = np.zeros((time, rows), bool), np.zeros((time, rows), bool)
+        valid, resting = np.ones((time, rows), bool), np.zeros(rows, bool)
         ends: list[np.ndarray] = []
         for t in range(time):
             obs[t] = self.env.encode(states)
@@ -120,11 +123,14 @@ class Simulator:
             states, result = self.env.simulate(states, actions[t])
             reward[t], score[t], terminated[t] = training_reward(spec, result), result.score, result.terminated
             age += 1
+            valid[t], terminated[t] = ~resting, terminated[t] | resting
             cut[t] = (result.truncated | (age >= limit)) & ~terminated[t]
             ends.append(states[cut[t]])
+            # A column whose task terminated rests for what its trajectory had left: each start weighs the same.
+            resting[layout.sp :] = (terminated[t] & (age < limit))[layout.sp :]
             if t == time - 1:
                 last = self.env.encode(states)
-            if (over := np.flatnonzero(cut[t] | terminated[t])).size:
+            if (over := np.flatnonzero((cut[t] | terminated[t]) & ~resting)).size:
                 states[over], age[over] = self._anew(layout, over, partner), 0
         self.running, self.age = states[: layout.sp].copy(), age[: layout.sp].copy()
         return Batch(
@@ -138,7 +144,8 @@ class Simulator:
             cut=torch.from_numpy(cut),
             cut_obs=torch.from_numpy(self.env.encode(np.concatenate(ends))),
             last_obs=torch.from_numpy(last),
-            trajectories=int(terminated.sum() + cut.sum() + (age > 0).sum()),
+            valid=torch.from_numpy(valid),
+            trajectories=int((terminated & valid).sum() + cut.sum() + ((age > 0) & ~resting).sum()),
         )
 
     def _begin(self, layout: Layout, partner: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

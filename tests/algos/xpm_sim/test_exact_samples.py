@@ -26,6 +26,7 @@ def batch_of(reward: list[list[float]], cut: list[list[int]], terminated: list[l
         cut=ends,
         cut_obs=(100.0 + numbers)[ends][:, None, None].expand(-1, 2, 1).clone(),
         last_obs=(200.0 + torch.arange(columns))[:, None, None].expand(columns, 2, 1).clone(),
+        valid=torch.ones_like(ends),
         trajectories=0,
     )
 
