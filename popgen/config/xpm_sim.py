@@ -25,7 +25,7 @@ class XpmSimConfig(Schema):
         sims_restart: self-play from B_XP;
         sims_xp: cross-play with one partner, `xp_initial` of them from the start, the others from B_XP.
     Objective: the three groups' means enter with `sp_weight`, `restart_weight` and -`lambda_xp`, which rises over
-        `lambda_ramp` updates. Advantages are in units of self-play's spread; those of cross-play are bounded by
+        `lambda_ramp` updates and is 0 after the share `lambda_until` of them. Advantages are in units of self-play's spread; those of cross-play are bounded by
         `xp_clip` of them (0: not at all), so that a large loss for the team, such as the penalty of leaving, is no
         larger gain than holding to another convention. Surrogate `ppo` (clipped, several epochs) or `reinforce`.
     Ablation: with encoder `shared` all members act on the latent of one variational autoencoder of the joint
@@ -63,6 +63,7 @@ class XpmSimConfig(Schema):
     grad_clip: Weight = 0.5
     lambda_xp: Weight = 0.5
     lambda_ramp: NonNegative = 10
+    lambda_until: Fraction = 1.0
     xp_clip: Weight = 0.0
     sp_weight: Weight = 1.0
     restart_weight: Weight = 1.0

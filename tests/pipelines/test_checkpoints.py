@@ -25,7 +25,7 @@ def run_of(root: Path, saves: int, long: int = 10**6) -> Checkpoints:
     segments = random_play(kitchen(2), 5)
     for number in range(saves):
         checkpoints.keep(segments, owner=1)
-        checkpoints.save(1, {"iteration": number, "weights": np.full(4, number)}, whole_buffers)
+        checkpoints.save(1, {"iteration": number, "weights": np.full(4, number), "ledger": number}, whole_buffers)
     return checkpoints
 
 
@@ -57,7 +57,7 @@ def test_the_one_before_counts_if_the_newest_is_damaged(tmp_path: Path, file: st
     assert state is not None and state["iteration"] == 1 and again.count == 2 and len(list(again.log())) == 2
     assert "progress_000003" in again.note and "\n" not in again.note
     again.keep(random_play(kitchen(2), 5), owner=1)
-    again.save(1, {"iteration": 2}, whole_buffers)
+    again.save(1, {"iteration": 2, "ledger": 2}, whole_buffers)
     fresh = Checkpoints(tmp_path, long=10**6, seconds=0.0)
     assert fresh.load(1)["iteration"] == 2 and not fresh.note  # type: ignore[index]
     assert {"progress_000002", "progress_000003"} <= names(tmp_path)

@@ -155,7 +155,7 @@ class XpmSimLearner:
 
         A partner without real episodes yet comes first. Randomness keeps every partner's critic fresh.
         """
-        if not self.partners or self.config.lambda_xp == 0.0 or not self.config.sims_xp:
+        if not self.partners or self.lambda_now() == 0.0 or not self.config.sims_xp:
             return None
         members = sorted(self.partners)
         if self.rng.random() < self.config.partner_random:
@@ -163,7 +163,9 @@ class XpmSimLearner:
         return max(members, key=lambda k: self.partner_scores.get(k, float("inf")))
 
     def lambda_now(self) -> float:
-        """lambda_XP of this update, rising linearly over the first `lambda_ramp`."""
+        """lambda_XP of this update, rising linearly over the first `lambda_ramp`; 0 after the share `lambda_until`."""
+        if self.updates >= self.config.lambda_until * self.config.updates:
+            return 0.0
         ramp = self.config.lambda_ramp
         return self.config.lambda_xp * (min(1.0, (self.updates + 1) / ramp) if ramp else 1.0)
 

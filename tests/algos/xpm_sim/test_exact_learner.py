@@ -79,6 +79,19 @@ def test_cross_play_lowers_what_earns_with_the_partner_and_self_play_raises_it()
             torch.testing.assert_close(other[0] - east[0], torch.tensor(made.lambda_now()))
 
 
+def test_a_large_loss_in_cross_play_gains_no_more_than_the_bound() -> None:
+    gains = []
+    for clip in (0.0, 1.0):
+        made = learner(partners=1, lambda_xp=1.0, lambda_ramp=0, xp_clip=clip, lam=0.0, discount=0.0)
+        batch = made.simulator.run(made._layout(1), made.actor.net, (1, made.partners[1].net))
+        reward = torch.zeros_like(batch.reward)
+        reward[0, batch.layout.cross.start] = -500.0
+        batch = type(batch)(**{**vars(batch), "reward": reward})
+        signed = made._cross_play(batch, 1, 2.0)[0][0].advantage
+        gains.append(float(signed.max() - signed.median()))
+    assert gains[0] > 200.0 and gains[1] < 2.0
+
+
 def test_lambda_rises_over_the_ramp() -> None:
     made = learner(lambda_xp=0.5, lambda_ramp=4)
     seen = []

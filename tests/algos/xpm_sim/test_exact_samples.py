@@ -66,6 +66,15 @@ def test_actions_of_seats_come_with_their_own_advantage() -> None:
     assert found.action.tolist() == [flat[0, 1, 1], flat[0, 2, 0], flat[1, 1, 1], flat[1, 2, 0]]
 
 
+def test_steps_of_no_trajectory_have_no_weight_and_the_mean_advantage() -> None:
+    batch = batch_of([[1.0, 3.0], [2.0, 50.0]], [[0, 0], [0, 0]], [[0, 1], [1, 1]], Layout(1, 0, 1))
+    batch.valid[1, 1] = False
+    advantage, _ = advantages(batch, slice(0, 2), lambda o, c: torch.zeros(len(o)), discount=0.5, lam=1.0)
+    torch.testing.assert_close(advantage, torch.tensor([[2.0, 3.0], [2.0, 7.0 / 3.0]]))
+    found = Actions.of_seats(batch, slice(0, 2), torch.tensor([0, 0]), advantage)
+    assert found.weight.tolist() == [1.0, 1.0, 1.0, 0.0]
+
+
 def test_groups_enter_with_the_weight_of_their_mean_whatever_their_size() -> None:
     def group(values: list[float]) -> Actions:
         x = torch.tensor(values)

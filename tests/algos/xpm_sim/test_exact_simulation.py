@@ -86,6 +86,19 @@ def test_leaving_the_bounds_is_terminal_and_not_cut() -> None:
     assert batch.reward[first, 0] < -4.0
 
 
+def test_cross_play_and_restarts_rest_after_leaving_so_that_each_start_weighs_the_same() -> None:
+    env = make_env("rendezvous/mppmr", 2)
+    config = XpmSimConfig(horizon=50, unroll=50, restart_horizon=25, xp_horizon=50)
+    simulator = Simulator(config, StartStates(config, env, 2, 0), 0)
+    batch = simulator.run(Layout(1, 1, 1), always(1, 5), (1, always(1, 5)))  # all go left, from the start
+    valid = batch.valid.numpy()
+    steps = int(valid[:, 2].sum())
+    assert valid[:, 0].all()  # self-play starts anew at once
+    assert 0 < steps < 25 and valid[:steps, 2].all() and batch.terminated[steps - 1, 2]
+    assert np.flatnonzero(valid[:, 1]).tolist() == [*range(steps), *range(25, 25 + steps)]
+    assert not batch.cut[:, 1:].any()
+
+
 def test_the_partner_sits_in_the_other_seat_of_cross_play_only() -> None:
     batch, _ = simulate(kitchen(), Layout(3, 2, 4), own=5)
     assert (batch.actions[:, :5] == 5).all()
