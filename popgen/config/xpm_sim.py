@@ -25,9 +25,10 @@ class XpmSimConfig(Schema):
         sims_restart: self-play from B_XP;
         sims_xp: cross-play with one partner, `xp_initial` of them from the start, the others from B_XP.
     Objective: the three groups' means enter with `sp_weight`, `restart_weight` and -`lambda_xp`, which rises over
-        `lambda_ramp` updates and is 0 after the share `lambda_until` of them. Advantages are in units of self-play's spread; those of cross-play are bounded by
-        `xp_clip` of them (0: not at all), so that a large loss for the team, such as the penalty of leaving, is no
-        larger gain than holding to another convention. Surrogate `ppo` (clipped, several epochs) or `reinforce`.
+        `lambda_ramp` updates and is 0 after the share `lambda_until` of them. Advantages are in units of self-play's
+        spread; those of cross-play are bounded by `xp_clip` of them (0: not at all), so that a large loss for the team,
+        such as the penalty of leaving, is no larger gain than holding to another convention. Surrogate `ppo`
+        (clipped, several epochs) or `reinforce`.
     Ablation: with encoder `shared` all members act on the latent of one variational autoencoder of the joint
         observation, trained on buffered states beside member 1 and on, at `encoder_lr_later` (0: frozen).
     """

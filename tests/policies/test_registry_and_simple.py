@@ -21,6 +21,9 @@ def example(kind: str, spec: EnvSpec) -> Policy:
         return policy_class(kind)(MODEL, AGENT, spec)  # type: ignore[call-arg]
     if kind == "feed_forward":
         return FeedForwardPolicy(spec.views["features"], spec.num_actions, units=8, seed=3)
+    if kind == "encoded":
+        sizes = {"units": 8, "latent": 3, "encoder_units": 8, "encoder_layers": 1}
+        return policy_class(kind)(spec.views["features"], spec.num_actions, seed=3, **sizes)  # type: ignore[call-arg]
     probabilities = [0.5, 0.5, 0.0, 0.0, 0.0]
     return RandomPolicy(spec.num_actions, probabilities) if kind == "random" else IdlePolicy(spec.action_names, "up")
 

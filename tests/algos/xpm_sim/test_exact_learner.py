@@ -101,6 +101,13 @@ def test_lambda_rises_over_the_ramp() -> None:
     assert learner(lambda_xp=0.5, lambda_ramp=0).lambda_now() == 0.5
 
 
+def test_pressure_can_end_before_training_does() -> None:
+    made = learner(lambda_xp=0.5, lambda_ramp=0, lambda_until=0.4, updates=10)
+    assert [made.lambda_now() for made.updates in (0, 3, 4, 9)] == [0.5, 0.5, 0.0, 0.0]
+    assert made.choose_partner() is None  # at update 9: only self-play, restarted from B_XP too
+    assert made._layout(None).restart == SMALL.sims_restart
+
+
 def test_the_strongest_partner_is_chosen_and_unseen_ones_first() -> None:
     made = learner(partners=3)
     assert made.choose_partner() == 3
