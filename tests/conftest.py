@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -52,3 +55,40 @@ def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer.add_member(WorldModelPolicy(config.world_model, config.agent, spec), seed=member, steps={"SP": 1})
     (run / "config.json").write_text(json.dumps(config.model_dump(mode="json")))
     return run
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[..., tuple[int, str, str]]:
+    """`run(*argv)` in an empty folder -> exit code, stdout, stderr."""
+    from popgen import cli
+
+    monkeypatch.chdir(tmp_path)
+
+    def call(*argv: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = cli.main(argv)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[None]:
+    """A Ray of the module's own; its sockets need a short path."""
+    import ray
+
+    folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")
+    ray.init(
+        address="local",
+        num_cpus=2,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level="ERROR",
+        _temp_dir=folder,
+    )
+    yield
+    ray.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)

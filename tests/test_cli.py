@@ -24,20 +24,6 @@ HEAVY = ("ray", "mlflow")
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """`run(*argv)` in an empty folder -> exit code, stdout, stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*argv: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = cli.main(argv)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
-
-
-@pytest.fixture
 def no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     """Importing Ray or MLflow fails, whether or not another test has imported it."""
     for name in HEAVY:

@@ -107,8 +107,8 @@ class MappoConfig(PPOConfig):
 
 
 def _no_mapping(agent: Any, *arguments: Any, **kwargs: Any) -> str:
-    """Agents are not mapped to modules: the runner knows who sits where."""
-    raise NotImplementedError
+    """RLlib wants a mapping and must not use it: the runner knows who sits where."""
+    raise RuntimeError(f"agent {agent!r} was to be mapped to a module, which only RLlib's own runners do")
 
 
 class Mappo(PPO):

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
-import tempfile
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import ray
 
 from pipelines import baselines
 from pipelines.books import Books
@@ -35,25 +31,11 @@ SP_STEPS = 240
 """Of each member: three iterations of 4 environments and 20 steps."""
 
 
+pytestmark = pytest.mark.usefixtures("cluster")
+
+
 class Killed(RuntimeError):
     """Injected where a driver could be killed."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cluster() -> Iterator[None]:
-    """A Ray of this module's own; its sockets need a short path."""
-    folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")
-    ray.init(
-        address="local",
-        num_cpus=2,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level="ERROR",
-        _temp_dir=folder,
-    )
-    yield
-    ray.shutdown()
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")

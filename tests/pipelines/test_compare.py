@@ -15,7 +15,6 @@ from finished import CRAMPED, finished_run
 import pipelines
 from pipelines.batch import check_different, named, run_all
 from pipelines.experiments import open_sources, sample_pair
-from popgen import cli
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
 from popgen.envs import make_env
@@ -27,20 +26,6 @@ from popgen.progress import NullReporter
 from popgen.tracking import SCALING_METRIC
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """`run(*argv)` in an empty folder -> exit code, stdout, stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*argv: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = cli.main(argv)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 @pytest.fixture
