@@ -96,6 +96,9 @@ class AgentConfig(Schema):
     actor_lr: Rate = 1e-3
     critic_lr: Rate = 1e-3
     entropy: Weight = 3e-3
+    entropy_end: Weight = 5e-4
+    entropy_hold: NonNegative = 1000
+    entropy_ramp: NonNegative = 1000
     grad_clip: Weight = 100.0
     unimix: UniformShare = 0.01
     bins: Annotated[_Int, Field(ge=3, le=10_001)] = 65

@@ -149,6 +149,24 @@ def test_a_lambda_below_the_starting_one_holds_from_the_first_update_on() -> Non
         assert learner.lambda_now() == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize(
+    ("end", "wanted"), [(1e-4, [1e-2, 1e-2, 1e-3, 1e-4, 1e-4]), (0.0, [1e-2, 1e-2, 5e-3, 0.0, 0.0]), (1.0, [1e-2] * 5)]
+)
+def test_the_entropy_scale_holds_and_then_falls_to_its_end(end: float, wanted: list[float]) -> None:
+    """By the same factor in each update; straight down to an end of zero; never up."""
+    learner = make_learner(entropy=1e-2, entropy_end=end, entropy_hold=10, entropy_ramp=20)
+    found = []
+    for learner.updates in (0, 10, 20, 30, 99):
+        found.append(learner.entropy_now())
+    assert found == pytest.approx(wanted)
+
+
+def test_without_a_ramp_the_entropy_scale_stays() -> None:
+    learner = make_learner(entropy=1e-2, entropy_ramp=0)
+    learner.updates = 10_000
+    assert learner.entropy_now() == 1e-2
+
+
 @pytest.mark.parametrize("key", [SELF, 1, 2])
 def test_each_critic_learns_from_its_own_trajectories_and_the_actor_from_no_value_loss(key: int) -> None:
     learner = make_learner()

@@ -26,18 +26,17 @@ def main() -> int:
     """Run the campaign; 0 if all faults were survived."""
     args = arguments()
     site = Site.open()
-    began = time.time()
+    began, rows = time.time(), []
     try:
         references = {method: reference(site, method) for method in args.methods}
         plan = schedule(args, random.Random(args.seed))
-        rows = []
         for number, (method, fault) in enumerate(plan, start=1):
             rows.append(
                 strike(site, number, method, fault, references[method], random.Random(args.seed * 1000 + number))
             )
             print(line(rows[-1]), flush=True)
     finally:
-        site.close()
+        site.close(keep=not all(row["survived"] for row in rows))
     return summary(rows, time.time() - began, args.json)
 
 

@@ -23,6 +23,9 @@ ACTORS = {
 }
 """Who is killed -> method -> what its process is called; a method without an entry has no such actor."""
 
+RAY_ENDED_US = 1
+"""Exit code of a driver whose process Ray ended, because its raylet was dead."""
+
 
 @dataclass
 class Hit:
@@ -162,7 +165,11 @@ def kill_node(hit: Hit) -> None:
 
 
 def kill_local_raylet(hit: Hit) -> None:
-    """kill -9 of the raylet of the driver's own Ray: the driver starts another one."""
+    """kill -9 of the raylet of the driver's own Ray: the driver starts another one.
+
+    Where Ray's library was just talking to the raylet it ends the driver's process as well, without a word; the same
+    run id is submitted again then.
+    """
     hit.place = ("cluster=laptop", "cluster.num_cpus=4")
     process = hit.start()
     if hit.reached(process):
@@ -171,7 +178,8 @@ def kill_local_raylet(hit: Hit) -> None:
                 hit.victim, hit.struck = "raylet", True
                 end(child)
                 break
-    hit.wait(process)
+    if hit.wait(process) == RAY_ENDED_US and hit.struck and not hit.told:
+        hit.wait(hit.start())
 
 
 def fill_disk(reserve: int) -> Callable[[Hit], None]:

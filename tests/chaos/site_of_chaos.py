@@ -80,12 +80,15 @@ class Site:
         self.cluster.remove_node(self.node, allow_graceful=False)
         self.node = None
 
-    def close(self) -> None:
-        """End everything that was started here."""
+    def close(self, keep: bool = False) -> None:
+        """End everything that was started here, and remove the folder unless there is something to look at in it."""
         for process in self.drivers:
             end(process)
         self.cluster.shutdown()
-        shutil.rmtree(self.folder, ignore_errors=True)
+        if keep:
+            print(f"kept: {self.folder}", flush=True)
+        else:
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     # ---- drivers ---------------------------------------------------------------------------------------------------
 

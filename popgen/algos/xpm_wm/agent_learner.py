@@ -155,6 +155,20 @@ class AgentLearner:
         start = min(self.config.lambda_start, end)
         return end if not ramp else start + (end - start) * min(1.0, self.updates / ramp)
 
+    def entropy_now(self) -> float:
+        """Entropy scale of this update: `entropy` for `entropy_hold` updates, then falling to `entropy_end` within
+        `entropy_ramp`, by the same factor in each.
+
+        Advantages are divided by the spread of returns, which grows tenfold once dishes are delivered: a scale that
+        lets self-play start would then win over them, and the policy would get more random the better it plays.
+        """
+        config = self.config
+        if not config.entropy_ramp:
+            return config.entropy
+        share = min(1.0, max(0.0, (self.updates - config.entropy_hold) / config.entropy_ramp))
+        end = min(config.entropy_end, config.entropy)
+        return config.entropy * (end / config.entropy) ** share if end else config.entropy * (1.0 - share)
+
     def _imagine(self, partner: int | None) -> tuple[Imagined, Tensor]:
         """Self-play rows and, after them, cross-play rows in one batch; the agent's seat in the latter."""
         if self.starts is None:
@@ -204,10 +218,11 @@ class AgentLearner:
         both = torch.tensor([0, 1], device=self.device).expand(steps, batch, 2)
         log_prob, entropy = self._policy_terms(pair, both, imagined.actions)
         running = imagined.running.unsqueeze(-1)
-        actor_loss = reinforce(log_prob, advantage.unsqueeze(-1), entropy, running, entropy_scale=self.config.entropy)
+        actor_loss = reinforce(log_prob, advantage.unsqueeze(-1), entropy, running, entropy_scale=self.entropy_now())
         critic_loss = (imagined.running * self.critics[str(SELF)].loss(latent, seat[:-1], returns)).mean()
         metrics = {
             "entropy": float(entropy.detach().mean()),
+            "entropy_scale": self.entropy_now(),
             "return_scale": float(scale),
             "imagined_shaped_sp": float(imagined.reward.mean()),
             "imagined_return_sp": float(returns.mean()),
@@ -228,7 +243,7 @@ class AgentLearner:
         own = imagined.actions.gather(-1, seat.unsqueeze(-1)).squeeze(-1)
         log_prob, entropy = self._policy_terms(latent, seat, own)
         actor_loss = reinforce(
-            log_prob, advantage, entropy, imagined.running, entropy_scale=self.config.entropy * weight
+            log_prob, advantage, entropy, imagined.running, entropy_scale=self.entropy_now() * weight
         )
         critic_loss = (imagined.running * self.critics[str(partner)].loss(latent, seat, returns)).mean()
         reward = float(imagined.reward.mean())
