@@ -36,13 +36,19 @@ class AgentActor:
         self.learner.restart(seed)
 
     def train(
-        self, updates: int, model: Weights, starts: Starts, new_share: float, partner_scores: dict[int, float]
+        self,
+        updates: int,
+        model: Weights,
+        starts: Starts,
+        new_share: float,
+        partner_scores: dict[int, float],
+        plays: bool,
     ) -> tuple[Weights, Weights, dict[str, float]]:
         """Imagine and update `updates` times; acting weights (filter and actor), critics and mean metrics."""
         began, began_cpu = time.perf_counter(), time.process_time()
         self.learner.set_model(model)
         self.learner.set_starts(starts, new_share)
-        self.learner.partner_scores = dict(partner_scores)
+        self.learner.partner_scores, self.learner.plays = dict(partner_scores), plays
         totals: dict[str, list[float]] = defaultdict(list)
         for _ in range(updates):
             for name, value in self.learner.update().items():

@@ -43,7 +43,7 @@ class FirstMember:
         self.figures: dict[str, float] = {}
         self.rounds = self.since_best = 0
         self.top: Snapshot | None = None
-        self.restarted = False
+        self.restarted = self.plays = False
         self.busy: Counter[str] = Counter()
         self.cpu: Counter[str] = Counter()
         self.report: Any = None
@@ -123,7 +123,7 @@ class FirstMember:
     def _learn_agent(self) -> tuple[Any, ...]:
         """References to acting weights, critics, model and metrics."""
         train = self.driver.crew.agent.train.options(num_returns=3)
-        acting, critics, info = train.remote(self.phase.agent_updates, self.model, self.starts, 0.0, {})
+        acting, critics, info = train.remote(self.phase.agent_updates, self.model, self.starts, 0.0, {}, self.plays)
         return acting, critics, self.model, info
 
     def _publish(self, result: tuple[Any, ...]) -> tuple[Published, Any]:
@@ -205,6 +205,7 @@ class FirstMember:
         if not self._full:
             return
         score = float(np.mean(self.recent))
+        self.plays |= score >= self.config.agent.entropy_after * self.phase.target_score
         if self.top is None or score > self.top.sp:
             self.top = Snapshot(self.played, score, 0.0)
             self.since_best = 0
@@ -245,7 +246,7 @@ class FirstMember:
             "recent": list(self.recent),
             "shaped": list(self.shaped),
             "figures": dict(self.figures),
-            "counters": [self.rounds, self.since_best, self.restarted],
+            "counters": [self.rounds, self.since_best, self.restarted, self.plays],
         }
         self.driver.save(MEMBER, self.rounds, {"first_member": state, "samplers": self.driver.crew.players.state()})
 
@@ -255,4 +256,4 @@ class FirstMember:
         self.recent.extend(state["recent"])
         self.shaped.extend(state["shaped"])
         self.figures = dict(state["figures"])
-        self.rounds, self.since_best, self.restarted = state["counters"]
+        self.rounds, self.since_best, self.restarted, self.plays = state["counters"]

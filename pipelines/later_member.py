@@ -34,6 +34,7 @@ class LaterMember:
         self.returns = PartnerReturns(self.config.agent.partner)
         self.best: Snapshot | None = None
         self.number = 0
+        self.plays = False
 
     def train(self, saved: dict[str, Any] | None) -> Snapshot:
         """All rounds; `saved` is a checkpoint to go on from, made when a round's episodes had been judged."""
@@ -84,7 +85,7 @@ class LaterMember:
         for first in range(0, updates, PIECE):
             count = min(PIECE, updates - first)
             train = crew.agent.train.options(num_returns=3)
-            acting, critics, info = train.remote(count, model, starts, new_share, scores)
+            acting, critics, info = train.remote(count, model, starts, new_share, scores, self.plays)
             metrics = ray.get(info)
             driver.log(self.member, **{f"agent/{k}": v for k, v in metrics.items()}, updates=done + first)
             driver.reporter.update(
@@ -116,6 +117,7 @@ class LaterMember:
             self.returns.add(partner, [e.shaped for e in found])
         strongest = max(float(np.mean([e.score for e in found])) for found in cross.values())
         snapshot = Snapshot(published, float(np.mean([e.score for e in own])), strongest)
+        self.plays |= snapshot.sp >= self.config.agent.entropy_after * self.phase.target_score
         if self.best is None or snapshot.merit > self.best.merit:
             self.best = snapshot
         driver.log(
@@ -132,11 +134,12 @@ class LaterMember:
 
     def _save(self) -> None:
         assert self.best is not None
-        state = {"best": self.best.state(), "returns": self.returns.state(), "number": self.number}
+        state = {"best": self.best.state(), "returns": self.returns.state(), "number": self.number, "plays": self.plays}
         self.driver.save(
             self.member, self.number, {"later_member": state, "samplers": self.driver.crew.players.state()}
         )
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.best, self.number = Snapshot.of(state["best"]), state["number"]
+        self.plays = bool(state["plays"])
         self.returns.load_state(state["returns"])

@@ -97,7 +97,7 @@ class AgentConfig(Schema):
     critic_lr: Rate = 1e-3
     entropy: Weight = 3e-3
     entropy_end: Weight = 5e-4
-    entropy_hold: NonNegative = 1000
+    entropy_after: Fraction = 0.5  # of a phase's target_score: the self-play at which the ramp begins
     entropy_ramp: NonNegative = 1000
     grad_clip: Weight = 100.0
     unimix: UniformShare = 0.01

@@ -152,19 +152,30 @@ def test_a_lambda_below_the_starting_one_holds_from_the_first_update_on() -> Non
 @pytest.mark.parametrize(
     ("end", "wanted"), [(1e-4, [1e-2, 1e-2, 1e-3, 1e-4, 1e-4]), (0.0, [1e-2, 1e-2, 5e-3, 0.0, 0.0]), (1.0, [1e-2] * 5)]
 )
-def test_the_entropy_scale_holds_and_then_falls_to_its_end(end: float, wanted: list[float]) -> None:
+def test_the_entropy_scale_falls_to_its_end_once_self_play_has_started(end: float, wanted: list[float]) -> None:
     """By the same factor in each update; straight down to an end of zero; never up."""
-    learner = make_learner(entropy=1e-2, entropy_end=end, entropy_hold=10, entropy_ramp=20)
+    learner = make_learner(entropy=1e-2, entropy_end=end, entropy_ramp=20)
     found = []
-    for learner.updates in (0, 10, 20, 30, 99):
+    for learner.playing in (0, 0, 10, 20, 99):
         found.append(learner.entropy_now())
     assert found == pytest.approx(wanted)
 
 
 def test_without_a_ramp_the_entropy_scale_stays() -> None:
     learner = make_learner(entropy=1e-2, entropy_ramp=0)
-    learner.updates = 10_000
+    learner.playing = 10_000
     assert learner.entropy_now() == 1e-2
+
+
+def test_updates_count_for_the_entropy_scale_only_once_self_play_has_started() -> None:
+    learner = make_learner(entropy_ramp=4)
+    for learner.plays, wanted in ((False, 0), (True, 1), (True, 2)):
+        learner.update()
+        assert learner.playing == wanted
+    state = learner.state()
+    other = make_learner(entropy_ramp=4)
+    other.load_state(state)
+    assert other.playing == 2 and other.entropy_now() == learner.entropy_now() < learner.config.entropy
 
 
 @pytest.mark.parametrize("key", [SELF, 1, 2])

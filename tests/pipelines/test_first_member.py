@@ -62,3 +62,15 @@ def test_without_a_whole_window_the_last_weights_are_all_there_is() -> None:
     assert first._best().published == "published" and first._best().sp == 0.0
     play(first, 4.0, 2.0)
     assert first._best().published == "published" and first._best().sp == 3.0
+
+
+def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_target() -> None:
+    first = member(target_score=10.0)
+    play(first, *[5.0] * 15)
+    assert not first.plays
+    play(first, 4.0)
+    assert not first.plays  # 4.94 of 5
+    play(first, 6.0)
+    assert first.plays
+    play(first, *[0.0] * 16)
+    assert first.plays  # for good

@@ -41,7 +41,8 @@ def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) ->
 class AgentLearner:
     """Actor, one self-play critic and one cross-play critic per partner of member `member`.
 
-    Set the world model, start states and partners, then call `update`. All tensors are on `device`; weights come and
+    Set the world model, start states and partners, then call `update`; set `plays` as soon as real self-play has
+    started. All tensors are on `device`; weights come and
     go as arrays. What the generators give differs between kinds of devices, initial weights do not.
     """
 
@@ -65,6 +66,7 @@ class AgentLearner:
         self.new_share = 0.0
         self.partner_scores: dict[int, float] = {}
         self.imagined_scores: dict[int, float] = {}
+        self.plays = False
         self.restart(seed)
 
     def restart(self, seed: int) -> None:
@@ -78,7 +80,7 @@ class AgentLearner:
             self._add_critic(partner)
         self.slow = copy.deepcopy(self.critics).requires_grad_(False)
         self._make_optimisers()
-        self.updates = 0
+        self.updates = self.playing = 0
 
     def _add_critic(self, key: int) -> None:
         self.critics[str(key)] = Critic(self.config, self.model_config).to(self.device)
@@ -137,6 +139,7 @@ class AgentLearner:
         self._step(self.critic_optimiser, critic_loss, self.critics.parameters())
         self._follow()
         self.updates += 1
+        self.playing += self.plays
         return metrics
 
     def _start_rows(self, rows: np.ndarray) -> Latent:
@@ -156,16 +159,16 @@ class AgentLearner:
         return end if not ramp else start + (end - start) * min(1.0, self.updates / ramp)
 
     def entropy_now(self) -> float:
-        """Entropy scale of this update: `entropy` for `entropy_hold` updates, then falling to `entropy_end` within
-        `entropy_ramp`, by the same factor in each.
+        """Entropy scale of this update: `entropy` until self-play has started, then falling to `entropy_end` within
+        `entropy_ramp` updates, by the same factor in each.
 
         Advantages are divided by the spread of returns, which grows tenfold once dishes are delivered: a scale that
         lets self-play start would then win over them, and the policy would get more random the better it plays.
         """
         config = self.config
-        if not config.entropy_ramp:
+        if not config.entropy_ramp or not self.playing:
             return config.entropy
-        share = min(1.0, max(0.0, (self.updates - config.entropy_hold) / config.entropy_ramp))
+        share = min(1.0, self.playing / config.entropy_ramp)
         end = min(config.entropy_end, config.entropy)
         return config.entropy * (end / config.entropy) ** share if end else config.entropy * (1.0 - share)
 
@@ -287,6 +290,7 @@ class AgentLearner:
             "generator": self.generator.get_state().numpy(),
             "rng": self.rng.bit_generator.state,
             "updates": self.updates,
+            "playing": self.playing,
             "partner_scores": {str(k): v for k, v in self.partner_scores.items()},
             "imagined_scores": {str(k): v for k, v in self.imagined_scores.items()},
         }
@@ -300,7 +304,7 @@ class AgentLearner:
         w.load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
         self.rng.bit_generator.state = state["rng"]
-        self.updates = state["updates"]
+        self.updates, self.playing = state["updates"], state["playing"]
         self.partner_scores = {int(k): v for k, v in state["partner_scores"].items()}
         self.imagined_scores = {int(k): v for k, v in state["imagined_scores"].items()}
 
