@@ -19,6 +19,9 @@ from pipelines.play import Players
 from popgen.config import ClusterConfig, RunConfig
 from popgen.errors import UserError
 
+STARTS = 4
+LATE = "timed out during startup"
+
 
 def start_ray(cluster: ClusterConfig) -> bool:
     """Connect to a cluster or start a local one; True if this call did it."""
@@ -29,20 +32,38 @@ def start_ray(cluster: ClusterConfig) -> bool:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     local = cluster.address is None
     limits = {"object_store_memory": cluster.object_store_bytes} if local and cluster.object_store_bytes else {}
+    arguments = {
+        # Without an address Ray would look for a running cluster before it starts a local one.
+        "address": "local" if local else cluster.address,
+        # On fewer cores than the actors ask for they take turns.
+        "num_cpus": cluster.num_cpus or max(os.cpu_count() or 1, math.ceil(cluster.cpus)) if local else None,
+        "include_dashboard": False if local else None,
+        "log_to_driver": False,
+        "logging_level": "ERROR",
+    }
     try:
-        ray.init(
-            # Without an address Ray would look for a running cluster before it starts a local one.
-            address="local" if local else cluster.address,
-            # On fewer cores than the actors ask for they take turns.
-            num_cpus=cluster.num_cpus or max(os.cpu_count() or 1, math.ceil(cluster.cpus)) if local else None,
-            include_dashboard=False if local else None,
-            log_to_driver=False,
-            logging_level="ERROR",
-            **limits,
-        )
+        _init(arguments | limits)
     except ConnectionError as error:
         raise UserError("cluster.address", f"no Ray answers ({error})", "start it, or use cluster=laptop") from None
     return True
+
+
+def _init(arguments: dict[str, Any]) -> None:
+    """`ray.init`, again where Ray gave up on its own processes: it waits half a minute, too short on a busy machine.
+
+    Raises:
+        UserError: it gave up `STARTS` times.
+    """
+    for _ in range(STARTS):
+        try:
+            ray.init(**arguments)
+            return
+        except Exception as error:  # Ray raises that very class
+            if LATE not in str(error):
+                raise
+        ray.shutdown()
+    problem = f"Ray did not come up in {STARTS} tries, the machine is too busy"
+    raise UserError("cluster", problem, "end other work; the same run.id goes on")
 
 
 def check_resources(cluster: ClusterConfig, have: Mapping[str, float]) -> None:

@@ -70,3 +70,40 @@ def test_a_local_ray_has_room_for_all_actors(monkeypatch: pytest.MonkeyPatch) ->
 def test_samplers_have_seeds_of_their_own() -> None:
     assert seed_of(7, 0) == 7
     assert len({seed_of(seed, index) for seed in range(20) for index in range(20)}) == 400
+
+
+def starting(monkeypatch: pytest.MonkeyPatch, *outcomes: Exception | None) -> list[str]:
+    """Ray's starts end as given, one after the other; what was called."""
+    calls, left = [], list(outcomes)
+
+    def init(**arguments: object) -> None:
+        calls.append("init")
+        if (outcome := left.pop(0)) is not None:
+            raise outcome
+
+    monkeypatch.setattr(crew.ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(crew.ray, "init", init)
+    monkeypatch.setattr(crew.ray, "shutdown", lambda: calls.append("shutdown"))
+    return calls
+
+
+LATE = Exception("The current node timed out during startup. This could happen ...")
+
+
+def test_a_ray_that_gave_up_on_a_busy_machine_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = starting(monkeypatch, LATE, LATE, None)
+    assert crew.start_ray(ClusterConfig())
+    assert calls == ["init", "shutdown"] * 2 + ["init"]
+
+
+def test_a_machine_too_busy_for_ray_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    starting(monkeypatch, *[LATE] * crew.STARTS)
+    with pytest.raises(UserError, match="did not come up in 4 tries"):
+        crew.start_ray(ClusterConfig())
+
+
+def test_another_error_of_ray_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = starting(monkeypatch, RuntimeError("something else"))
+    with pytest.raises(RuntimeError, match="something else"):
+        crew.start_ray(ClusterConfig())
+    assert calls == ["init"]
