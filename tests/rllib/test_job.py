@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from popgen.config import DiversityConfig, EnvConfig, PpoConfig
+from popgen.cli.compose import compose
+from popgen.config import DiversityConfig, EnvConfig, PpoConfig, RunConfig
 from popgen.errors import UserError
 from popgen.rllib.job import Group, Job, policy_config, share
 from popgen.types import Kind
@@ -77,3 +78,18 @@ def test_recipes_that_cannot_be_are_refused(values: dict, field: str) -> None:
 def test_both_seatings_need_an_even_number_of_environments() -> None:
     with pytest.raises(ValueError, match="multiple of 2"):
         DiversityConfig(xp_envs=3)
+
+
+@pytest.mark.parametrize(
+    ("env", "entropy"),
+    [
+        ("overcooked/counter_circuit_o_1order", (0.2, 0.1)),
+        ("overcooked/cramped_room", (0.01, 1.0)),
+        ("rendezvous/mppmr", (0.01, 1.0)),
+    ],
+)
+def test_the_laptop_explores_more_where_deliveries_are_far_from_the_pots(
+    env: str, entropy: tuple[float, float]
+) -> None:
+    ppo = RunConfig.parse(compose(["scale=laptop", "method=mappo", f"env={env}"])).ppo
+    assert (ppo.entropy, ppo.entropy_end) == entropy
