@@ -10,6 +10,7 @@ from typing import Any
 
 import ray
 from ray.exceptions import RayError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from popgen.config import TrackingConfig
 from popgen.tracking import Tracker
@@ -123,8 +124,9 @@ class RemoteTracker:
     # ---- a tracker that may die ------------------------------------------------------------------------------------
 
     def _hire(self) -> None:
-        """An actor that gets all that may not have been written."""
-        self._actor = ray.remote(TrackerActor).options(num_cpus=0).remote()
+        """An actor on the driver's node, whose files it reads, that gets all that may not have been written."""
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+        self._actor = ray.remote(TrackerActor).options(num_cpus=0, scheduling_strategy=here).remote()
         ray.get(self._actor.open.remote(*self._arguments, self._state))
         self._mark = None
         for call in self._unwritten:

@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections import Counter
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -191,6 +192,18 @@ class Books:
     def member_steps(self) -> list[int]:
         """Environment steps that each member's training took, those of another run included."""
         return [info.total_steps for info in load_population(self.population.path).members]
+
+    def log_artefacts(self, report: Iterable[Path]) -> None:
+        """Copy what the run leaves behind to its MLflow run: configuration, ledger, population and report.
+
+        They have the names of the run's folder there. Done again, they replace those of before.
+        """
+        self.ledger.to_csv(self.dir / "ledger.csv")
+        for name in ("config.json", "ledger.jsonl", "ledger.csv"):
+            self.tracker.log_artifact(self.dir / name)
+        self.tracker.log_artifact(self.population.path, "population")
+        for path in report:
+            self.tracker.log_artifact(path, "report")
 
     def save_tracking(self) -> None:
         """Keep the MLflow run ids: a resumed run goes on in the same MLflow runs."""

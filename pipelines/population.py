@@ -186,8 +186,7 @@ def finish(config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -
     files |= write_run_figures(
         books.dir, books.dir / "report", books.member_steps(), unit=spec.score_name, title=spec.name
     )
-    for file in files.values():
-        books.tracker.log_artifact(file, "report")
+    books.log_artefacts(files.values())
     figures = {"sp": result.sp.mean, "xp": result.xp.mean}
     books.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
     evaluation = to_dict(result)

@@ -65,8 +65,8 @@ def check_uri(uri: str | None, timeout: float = 5.0) -> None:
 class Tracker:
     """Buffers metrics and writes them to MLflow in batches.
 
-    A store that stops answering does not stop training: what could not be written stays buffered for the next
-    `flush` and a warning is logged.
+    A store that stops answering does not stop training: points that could not be written stay buffered for the next
+    `flush` and a warning is logged. An artefact that it does not take is missing, which a warning tells too.
 
     Args:
         config: where to track; with `enabled` false every call does nothing.
@@ -90,7 +90,7 @@ class Tracker:
         self.config, self.run_dir, self.run_name = config, Path(run_dir).resolve(), run_name
         self.uri = config.uri or f"sqlite:///{self.run_dir / 'mlflow.db'}"
         self._runs: dict[str, str] = dict((resume or {}).get("runs", {}))
-        self._points: dict[str, list[Any]] = {}
+        self._points: dict[int | None, list[Any]] = {}
         self._client: Any = None
         self._monitor: Any = None
         self._resumed = resume is not None
@@ -112,7 +112,7 @@ class Tracker:
         from mlflow.entities import Metric
 
         now = int(time.time() * 1000) if when is None else when
-        points = self._points.setdefault(self._run(member), [])
+        points = self._points.setdefault(member, [])
         points += [Metric(name, float(value), now, int(step)) for name, value in metrics.items()]
         if len(points) >= BATCH:
             self.flush()
@@ -122,19 +122,23 @@ class Tracker:
         self.log({SCALING_METRIC: environment_steps}, step=members)
 
     def log_artifact(self, path: str | Path, folder: str | None = None, member: int | None = None) -> None:
-        """Copy a file, or a folder with all it holds, to the run's artefacts."""
+        """Copy a file, or what a folder holds, to the run's artefacts, into `folder` of these.
+
+        A file that is there under the same name is replaced, so that a run that goes on has each once.
+        """
         if not self.enabled:
             return
-        run, path = self._run(member), Path(path)
+        path = Path(path)
         send = self._client.log_artifacts if path.is_dir() else self._client.log_artifact
-        self._try(lambda: send(run, str(path), folder))
+        # Each kind of artefact store raises errors of its own.
+        self._try(lambda: send(self._run(member), str(path), folder), Exception)
 
     def flush(self) -> None:
         """Write everything buffered, `BATCH` points a call."""
-        for run, points in self._points.items():
+        for member, points in self._points.items():
             while points:
                 batch = points[:BATCH]
-                if not self._try(lambda run=run, batch=batch: self._client.log_batch(run, metrics=batch)):
+                if not self._try(lambda m=member, batch=batch: self._client.log_batch(self._run(m), metrics=batch)):
                     del points[: max(0, len(points) - KEPT)]
                     break
                 del points[:BATCH]
@@ -227,12 +231,12 @@ class Tracker:
         for start in range(0, len(flat), 100):
             self._try(lambda start=start: self._client.log_batch(run, params=flat[start : start + 100]))
 
-    def _try(self, call: Any) -> bool:
+    def _try(self, call: Any, *errors: type[Exception]) -> bool:
         from mlflow.exceptions import MlflowException
 
         try:
             call()
-        except (MlflowException, OSError) as error:
+        except (MlflowException, OSError, *errors) as error:
             _log.warning(
                 "tracking: %s did not take a write, training goes on (%s)", self.uri, str(error).partition("\n")[0]
             )

@@ -40,7 +40,7 @@ def random_population(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's folder with two untrained members of the sizes of scale=smoke, and a checkpoint folder of the first."""
-    from popgen.cli import compose
+    from popgen.cli.compose import compose
     from popgen.config import RunConfig
     from popgen.envs import make_env
     from popgen.policies.world_model_policy import WorldModelPolicy

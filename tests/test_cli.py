@@ -14,7 +14,9 @@ import pytest
 from conftest import ROOT
 
 import popgen
-from popgen import cli, preflight
+from popgen import preflight
+from popgen.cli import population as population_commands
+from popgen.cli.printing import print_json
 from popgen.errors import UserError
 
 Run = Callable[..., tuple[int, str, str]]
@@ -262,7 +264,7 @@ def test_a_disk_that_fills_up_is_one_line(number: int, run: Run, monkeypatch: py
     def full(_: Any) -> int:
         raise OSError(number, os.strerror(number), "runs/r/ledger.jsonl")
 
-    monkeypatch.setattr(cli, "_show", full)
+    monkeypatch.setattr(population_commands, "show", full)
     refused(run("show", "."), "runs/r/ledger.jsonl", "disk")
 
 
@@ -270,7 +272,7 @@ def test_an_error_of_ours_keeps_its_traceback(run: Run, monkeypatch: pytest.Monk
     def wrong(_: Any) -> int:
         raise OSError(errno.EIO, "the driver's own trouble")
 
-    monkeypatch.setattr(cli, "_show", wrong)
+    monkeypatch.setattr(population_commands, "show", wrong)
     with pytest.raises(OSError, match="own trouble"):
         run("show", ".")
 
@@ -279,7 +281,7 @@ def test_interruption_gives_130(run: Run, monkeypatch: pytest.MonkeyPatch) -> No
     def stopped(_: Any) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_show", stopped)
+    monkeypatch.setattr(population_commands, "show", stopped)
     assert run("show", ".") == (130, "", "popgen: interrupted\n")
 
 
@@ -378,7 +380,7 @@ def test_a_layout_of_ones_own_is_measured_without_a_reference(run: Run) -> None:
 def test_figures_that_are_not_finite_become_null(capsys: pytest.CaptureFixture[str]) -> None:
     import numpy as np
 
-    cli._print_json({"a": [float("nan"), np.float32("inf"), np.arange(2)], "b": Path("x"), 3: np.int64(4)})
+    print_json({"a": [float("nan"), np.float32("inf"), np.arange(2)], "b": Path("x"), 3: np.int64(4)})
     assert json.loads(capsys.readouterr().out) == {"a": [None, None, [0, 1]], "b": "x", "3": 4}
 
 

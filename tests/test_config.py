@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from popgen.cli import compose, group_options
+from popgen.cli.compose import compose, group_options
 from popgen.config import RunConfig, closest_field
 from popgen.envs import env_names, make_env
 from popgen.errors import UserError

@@ -25,7 +25,7 @@ from pipelines import population as main_job
 from pipelines import xpm_wm
 from pipelines.checkpoints import Checkpoints
 from popgen import cli
-from popgen.cli import compose
+from popgen.cli.compose import compose
 from popgen.config import RunConfig
 from popgen.data.checkpoint import ARRAYS, VALUES, load_state, save_state
 from popgen.progress import NullReporter

@@ -206,7 +206,9 @@ def test_the_cluster_is_healthy_closed_and_on_the_loopback(cluster: Cluster) -> 
     assert not (cluster.folder / ".ray").exists()  # no token is kept in the home
 
 
-def test_a_job_ends_with_exit_code_0_its_population_and_its_mlflow_run(cluster: Cluster, unbroken: Path) -> None:
+def test_a_job_ends_with_exit_code_0_its_population_and_its_mlflow_run(
+    cluster: Cluster, unbroken: Path, tmp_path: Path
+) -> None:
     from mlflow.tracking import MlflowClient
 
     assert len(load_population(unbroken / "population")) == 1
@@ -220,7 +222,10 @@ def test_a_job_ends_with_exit_code_0_its_population_and_its_mlflow_run(cluster: 
     assert runs.keys() == {"unbroken", "unbroken/member_001"}
     assert {run.info.status for run in runs.values()} == {"FINISHED"}
     assert runs["unbroken"].data.metrics["environment_steps_by_members"] == 4000
-    assert {file.path for file in client.list_artifacts(runs["unbroken"].info.run_id, "report")}
+    there = {file.path for file in client.list_artifacts(runs["unbroken"].info.run_id)}
+    assert there == {"config.json", "ledger.csv", "ledger.jsonl", "population", "report"}
+    copy = client.download_artifacts(runs["unbroken"].info.run_id, "population", str(tmp_path))
+    assert [info.policy_sha256 for info in load_population(copy).members] == sha256s(unbroken)
 
 
 def test_runs_and_virtual_environments_stay_at_home(cluster: Cluster, unbroken: Path) -> None:

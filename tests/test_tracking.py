@@ -104,6 +104,37 @@ def test_points_go_out_in_batches(tmp_path: Path) -> None:
     assert calls[-1] == 1 and history(tracker, "parent", "a")[-1] == (2000, 3.0)
 
 
+def test_a_store_that_is_away_when_a_member_begins_gets_its_points_later(tmp_path: Path) -> None:
+    tracker = Tracker(TrackingConfig(), tmp_path, "r")
+    create = tracker._client.create_run
+
+    def away(*_: Any, **__: Any) -> None:
+        raise ConnectionError("the store went away")
+
+    tracker._client.create_run = away
+    tracker.log({"a": 1.0}, step=3, member=1)
+    tracker.flush()
+    assert tracker.state()["runs"].keys() == {"parent"}
+    tracker._client.create_run = create
+    tracker.flush()
+    assert history(tracker, "member_001", "a") == [(3, 1.0)]
+
+
+def test_an_artefact_that_is_not_taken_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class OfAnotherLibrary(Exception):
+        pass
+
+    def refuse(*_: Any) -> None:
+        raise OfAnotherLibrary("no such bucket")
+
+    tracker = Tracker(TrackingConfig(), tmp_path / "run", "r")
+    tracker.log_artifact(tmp_path / "gone.csv")
+    tracker._client.log_artifacts = refuse
+    tracker.log_artifact(tmp_path / "run")
+    assert len(caplog.records) == 2 and "no such bucket" in caplog.text
+    tracker.finish()
+
+
 def test_off_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mlflow", None)  # an import would fail
     tracker = Tracker(TrackingConfig(enabled=False), tmp_path / "run", "r", {"a": 1})

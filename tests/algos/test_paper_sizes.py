@@ -10,7 +10,7 @@ from torch import nn
 from popgen.algos.xpm_wm.agent_learner import AgentLearner
 from popgen.algos.xpm_wm.recipe import model_batch, start_batch
 from popgen.algos.xpm_wm.starts import NEW_SP, NEW_XP, OLD, Starts, draw_cross_play, draw_self_play
-from popgen.cli import compose
+from popgen.cli.compose import compose
 from popgen.config import RunConfig
 from popgen.data.replay import Query
 from popgen.envs import make_env

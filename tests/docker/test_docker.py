@@ -14,7 +14,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-from popgen.cli import compose
+from popgen.cli.compose import compose
 
 DOCKER = ROOT / "docker"
 ENTRY = DOCKER / "entrypoint.sh"

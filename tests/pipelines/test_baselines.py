@@ -16,7 +16,7 @@ import pytest
 from pipelines import baselines
 from pipelines.books import Books
 from pipelines.population import driver_class, run_population
-from popgen.cli import compose
+from popgen.cli.compose import compose
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
 from popgen.envs import make_env

@@ -13,6 +13,9 @@ from pipelines.report import training_curves
 from popgen.config import RunConfig, RunSection, TrackingConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.policies.simple import RandomPolicy
+from popgen.tracking import Tracker
+from popgen.types import Kind
 
 SPEC = make_env("overcooked/cramped_room").spec
 
@@ -54,3 +57,30 @@ def test_half_a_point_is_dropped_and_repeated_points_count_once(tmp_path: Path) 
         "member 2, SP": ([50], [7.0]),
         "member 2, strongest XP": ([50], [0.5]),
     }
+
+
+def test_artefacts_of_a_run_that_goes_on_are_there_once_and_the_latest(tmp_path: Path) -> None:
+    config = RunConfig(run=RunSection(root=str(tmp_path), id="r"))
+    report = tmp_path / "matrix.csv"
+    state = None
+    for attempt in (1, 2):
+        tracker = Tracker(config.tracking, tmp_path / "store", "r", resume=state)
+        kept = Books(config, SPEC, tracker)  # type: ignore[arg-type]
+        kept.population.add_member(RandomPolicy(SPEC.num_actions), seed=attempt, steps={"SP": 7})
+        kept.record_steps(attempt, Kind.SP, "sampler", 0, 7 * attempt, 0)
+        report.write_text(f"{attempt}\n")
+        kept.log_artefacts([report])
+        kept.close("FINISHED")
+        state = tracker.state()
+    (copies,) = (tmp_path / "store" / "mlflow_artifacts").glob("*/artifacts")
+    names = {path.relative_to(copies).as_posix() for path in copies.rglob("*") if path.is_file()}
+    members = {f"population/member_00{n}/{name}" for n in (1, 2) for name in ("member.json", "policy.safetensors")}
+    assert names == members | {
+        *("config.json", "ledger.csv", "ledger.jsonl", "population/manifest.json", "report/matrix.csv"),
+    }
+    for name in names - {"report/matrix.csv"}:
+        assert (copies / name).read_bytes() == (tmp_path / "r" / name).read_bytes()
+    assert (copies / "report" / "matrix.csv").read_text() == "2\n"
+    assert (copies / "ledger.csv").read_text().split() == [
+        *("member,kind,steps,episodes,score", "1,SP,7,0,0.0", "2,SP,14,0,0.0")
+    ]

@@ -24,7 +24,7 @@ from pipelines.checkpoints import Checkpoints
 from pipelines.crew import Crew
 from pipelines.later_member import LaterMember
 from pipelines.population import run_population
-from popgen.cli import compose
+from popgen.cli.compose import compose
 from popgen.config import RunConfig
 from popgen.data.checkpoint import load_state
 from popgen.data.ledger import Ledger
@@ -139,7 +139,7 @@ def launch(
 
 @pytest.fixture(scope="module")
 def whole(cluster: None, root: Path) -> Run:
-    return launch(root, "whole", local=False)
+    return launch(root, "whole", "tracking.enabled=true", local=False)
 
 
 @pytest.fixture(scope="module")
@@ -209,6 +209,29 @@ def test_the_population_holds_both_members_and_their_steps(whole: Run) -> None:
         assert {"sp", "xp", "seconds", "world_model"} <= info.extra.keys()
     assert np.shape(whole.result["matrix"]["mean"]) == (2, 2)
     assert all(Path(path).exists() for path in whole.result["files"].values())
+
+
+def test_the_mlflow_run_holds_what_the_run_leaves_behind(whole: Run, tmp_path: Path) -> None:
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient(tracking_uri=f"sqlite:///{whole.dir}/mlflow.db")
+    runs = json.loads((whole.dir / "tracking.json").read_text())["runs"]
+    assert runs.keys() == {"parent", "member_001", "member_002"}
+    assert {client.get_run(run).info.status for run in runs.values()} == {"FINISHED"}
+    got = Path(client.download_artifacts(runs["parent"], "", str(tmp_path)))
+    assert {path.name for path in got.iterdir()} == {
+        "config.json",
+        "ledger.jsonl",
+        "ledger.csv",
+        "population",
+        "report",
+    }
+    for path in (path for path in got.rglob("*") if path.is_file()):
+        assert path.read_bytes() == (whole.dir / path.relative_to(got)).read_bytes()
+    assert {path.name for path in (got / "report").iterdir()} == {Path(p).name for p in whole.result["files"].values()}
+    assert [info.policy_sha256 for info in load_population(got / "population").members] == sha256s(whole)
+    rows = (got / "ledger.csv").read_text().splitlines()[1:]
+    assert sum(int(row.split(",")[2]) for row in rows) == whole.result["ledger"]["total"]["total"]
 
 
 def test_episodes_are_those_of_the_steps(whole: Run) -> None:

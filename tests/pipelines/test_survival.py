@@ -100,7 +100,7 @@ def test_nodes_are_waited_for_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) 
 def run_with(monkeypatch: pytest.MonkeyPatch, root: Path, attempts: list[Callable[[Any], None]], **cluster: Any) -> Any:
     """The main job with a driver that does, attempt by attempt, what it is given."""
     from pipelines.population import run_population
-    from popgen.cli import compose
+    from popgen.cli.compose import compose
     from popgen.config import RunConfig
     from popgen.progress import NullReporter
 

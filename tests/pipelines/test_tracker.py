@@ -86,6 +86,7 @@ def actors(monkeypatch: pytest.MonkeyPatch) -> list[FakeActor]:
         return SimpleNamespace(options=lambda **options: SimpleNamespace(remote=hire))
 
     fake = SimpleNamespace(remote=remote, get=get, wait=lambda refs, timeout: (refs, []), kill=lambda actor: None)
+    fake.get_runtime_context = lambda: SimpleNamespace(get_node_id=lambda: "0" * 56)
     monkeypatch.setattr(module, "ray", fake)
     return hired
 

@@ -24,7 +24,7 @@ from pipelines.checkpoints import Checkpoints
 from pipelines.play import Players
 from pipelines.population import run_population
 from pipelines.xpm_sim import Member
-from popgen.cli import compose
+from popgen.cli.compose import compose
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
 from popgen.errors import UserError

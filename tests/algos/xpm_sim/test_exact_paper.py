@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from popgen.algos.xpm_sim.learner import XpmSimLearner, make_actor
-from popgen.cli import compose
+from popgen.cli.compose import compose
 from popgen.config import RunConfig
 from popgen.envs import make_env
 

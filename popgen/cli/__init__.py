@@ -1,0 +1,63 @@
+"""`popgen COMMAND ...`: the command line.
+
+    parser       the whole command line; each module of commands adds its own part
+    run, population, comparison, experiments, bench    the commands, by subject
+    training     what the commands that train share
+    compose      configuration files and overrides: the only file that knows Hydra
+    arguments    the parser's class and the types of arguments
+    printing     results on stdout
+
+Whatever a user can get wrong becomes one line on stderr and exit code 2, before Ray starts; torch, Ray and MLflow are
+imported only by the commands that need them. Results go to stdout, progress to stderr.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Sequence
+
+from popgen.cli.parser import parse
+from popgen.cli.printing import ERROR, INTERRUPTED, OK, short
+from popgen.errors import UserError
+
+_ROOM = "make room or choose another folder; finished parts are kept"
+_DISK = {
+    errno.ENOSPC: ("the disk is full", _ROOM),
+    errno.EDQUOT: ("the disk quota is used up", _ROOM),
+    errno.EROFS: ("the file system is read-only", "choose another folder"),
+    errno.EACCES: ("permission denied", "choose a folder you can read and write"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, 2 for an error told in one line, 130 when interrupted."""
+    try:
+        args = parse(sys.argv[1:] if argv is None else list(argv))
+        return args.command(args)
+    except SystemExit as stop:  # --help and --version
+        return int(stop.code or 0)
+    except UserError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        print("popgen: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output went away
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except RecursionError:
+        return _fail(str(UserError("input", "is nested too deeply", "give plain values")))
+    except MemoryError as error:
+        return _fail(str(UserError("memory", f"is not enough ({error})", "ask for less at a time")))
+    except OSError as error:
+        if error.errno not in _DISK and error.filename is None:
+            raise
+        where = short(str(error.filename or "disk"))
+        problem, fix = _DISK.get(error.errno or 0, (error.strerror or str(error), "check the path"))
+        return _fail(str(UserError(where, problem, fix)))
+
+
+def _fail(message: str) -> int:
+    print(f"popgen: error: {short(' '.join(message.split()), 2000)}", file=sys.stderr)
+    return ERROR

@@ -1,0 +1,120 @@
+"""The parser's class, what every command has, and the types of arguments."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from popgen.errors import UserError
+
+
+class Parser(argparse.ArgumentParser):
+    """Mistakes are the user's errors."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises: UserError."""
+        raise UserError("arguments", message, f"see {self.prog} --help")
+
+
+def add_command(
+    commands: Any, name: str, command: Callable[[argparse.Namespace], int], summary: str, details: str
+) -> argparse.ArgumentParser:
+    """A command with the options that all have.
+
+    Args:
+        commands: of `add_subparsers`.
+        name: of the command.
+        command: gets the parsed arguments and returns the exit code.
+        summary: in a line, without a capital or a full stop.
+        details: of its help, below the options.
+    """
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.", epilog=details
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    parser.set_defaults(command=command)
+    return parser
+
+
+def at_least(minimum: int) -> Callable[[str], int]:
+    """A whole number from `minimum` to 2^31 - 1."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"must be a whole number, got {text!r}") from None
+        if not minimum <= value < 2**31:
+            raise argparse.ArgumentTypeError(f"must be at least {minimum} and below 2^31, got {value}")
+        return value
+
+    return read
+
+
+def positive(text: str) -> float:
+    """A finite number above 0."""
+    value = _number(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
+    return value
+
+
+def finite(text: str) -> float:
+    """A finite number."""
+    value = _number(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def numbers(text: str) -> list[int]:
+    """1,2,..."""
+    return [at_least(1)(part) for part in text.split(",")]
+
+
+def words(text: str) -> list[str]:
+    """Words as a shell would split them."""
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"cannot read {text!r} ({error})") from None
+
+
+def named_path(text: str) -> tuple[str | None, str]:
+    """NAME=PATH, or a path alone; a name holds no slash."""
+    name, equals, _ = text.partition("=")
+    if not equals or "/" in name:
+        return None, text
+    return label_and_path(text)
+
+
+def label_and_path(text: str) -> tuple[str, str]:
+    """NAME=PATH."""
+    name, _, path = text.partition("=")
+    if not name or not path or "/" in name or len(name) > 40:
+        raise argparse.ArgumentTypeError(f"must be NAME=PATH with a short name without slashes, got {text!r}")
+    return name, path
+
+
+def pair(text: str) -> tuple[str, Any]:
+    """KEY=VALUE, the value as YAML reads it."""
+    import yaml
+
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE, got {text!r}")
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise argparse.ArgumentTypeError(f"cannot read the value of {text!r}") from None

@@ -1,0 +1,42 @@
+"""The whole command line: arguments in, a namespace with the command to call out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import popgen
+from popgen.cli import bench, comparison, experiments, population, run
+from popgen.cli.arguments import Parser
+from popgen.cli.printing import ERROR
+from popgen.errors import UserError
+
+
+def parse(argv: list[str]) -> argparse.Namespace:
+    """The arguments; `command` is the function to call with them.
+
+    Raises:
+        UserError: arguments that are wrong.
+        SystemExit: there was nothing but a help text or the version to print.
+    """
+    parser = _parser()
+    args, rest = parser.parse_known_args(argv)
+    if hasattr(args, "overrides"):  # overrides may stand after options too
+        args.overrides = [*args.overrides, *(word for word in rest if not word.startswith("-"))]
+        rest = [word for word in rest if word.startswith("-")]
+    if rest:
+        raise UserError("arguments", f"unknown argument {rest[0]}", "see popgen --help")
+    if args.command is None:
+        parser.print_help(sys.stderr)
+        raise SystemExit(ERROR)
+    return args
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="popgen", description="Populations of diverse cooperative partner agents.")
+    parser.add_argument("--version", action="version", version=f"popgen {popgen.__version__}")
+    parser.set_defaults(command=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+    for subject in (run, population, comparison, experiments, bench):
+        subject.add(commands)
+    return parser

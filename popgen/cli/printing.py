@@ -1,0 +1,45 @@
+"""Results on stdout, and exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from popgen.jsonable import jsonable
+
+OK, ERROR, INTERRUPTED = 0, 2, 130
+
+
+def short(text: str, length: int = 100) -> str:
+    """The text, cut to `length` characters."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """Exactly one JSON object; numbers that are not finite become null."""
+    print(json.dumps(jsonable(value), allow_nan=False))
+
+
+def print_table(table: Any) -> None:
+    """One of rich's."""
+    from rich.console import Console
+
+    # Piped output has no width of its own; tables of many members must not be cut.
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def print_report(tables: Iterable[Any], lines: Iterable[str], out: str, files: Iterable[str]) -> None:
+    """Tables, sentences, and where the report's files are."""
+    for table in tables:
+        print_table(table)
+    print("\n".join([*lines, f"report: {out} ({', '.join(files)})"]))
+
+
+def figure_text(figure: Mapping[str, float | None]) -> str:
+    """A mean with its standard error, where it has them."""
+    mean, error = figure["mean"], figure["standard_error"]
+    if mean is None:
+        return "-"
+    return f"{mean:.2f}" if error is None else f"{mean:.2f} ± {error:.2f}"
