@@ -37,7 +37,8 @@ class FirstMember:
 
     def __init__(self, driver: XpmWm, seed: int) -> None:
         self.driver, self.config, self.phase, self.seed = driver, driver.config, driver.config.phase1, seed
-        window = max(16, self.phase.envs // 2)
+        # An episode of each environment: fewer reach the target by luck, where some episodes end in a stand-still.
+        window = max(16, self.phase.envs)
         self.recent: deque[float] = deque(maxlen=window)
         self.shaped: deque[float] = deque(maxlen=window)
         self.figures: dict[str, float] = {}
