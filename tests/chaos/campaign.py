@@ -92,9 +92,10 @@ def strike(
     row = {"number": number, "method": method, "fault": fault.name, "event": moment, "victim": hit.victim}
     row |= {"submissions": hit.submissions, "told": hit.told, "seconds": round(time.time() - began, 1)}
     run = hit.run
+    row |= {"struck": hit.struck, "attempts": 0, "repeated": 0}
     if not hit.struck or hit.code:
-        problem = f"{'hit' if hit.struck else 'not hit'}, exit {hit.code}: {hit.told}"
-        return row | {"survived": False, "problem": problem, "attempts": 0, "repeated": 0}
+        problem = f"exit {hit.code}: {hit.told}" if hit.code else f"the run ended before it, {TRIES} times"
+        return row | {"survived": False, "problem": problem}
     books, wanted = Books.of(run), known["books"]
     problems = [what for what in ("weights", "entries", "totals") if getattr(books, what) != getattr(wanted, what)]
     problems += ["error text"] * (fault.one_line and not one_line(hit.told))
@@ -110,20 +111,24 @@ def one_line(told: list[str]) -> bool:
 
 def line(row: dict[str, Any]) -> str:
     """Of the table."""
-    verdict = "survived" if row["survived"] else f"FAILED ({row['problem']})"
+    failed = f"{'FAILED' if row['struck'] else 'missed'} ({row['problem']})"
+    verdict = "survived" if row["survived"] else failed
     parts = (f"{row['number']:3d}", f"{row['method']:8s}", f"{row['fault']:22s}", f"after event {row['event']:3d}")
     more = (f"{row['attempts']} attempts", f"{row['submissions']} calls", f"{row['repeated']:5d} steps again")
     return "  ".join([*parts, *more, f"{row['seconds']:5.0f} s", verdict, str(row["victim"])])
 
 
 def summary(rows: list[dict[str, Any]], seconds: float, path: Path | None) -> int:
-    """What the campaign found; the exit code."""
-    survived = sum(row["survived"] for row in rows)
-    kinds = Counter(row["fault"] for row in rows)
-    print(f"{survived} of {len(rows)} faults of {len(kinds)} kinds survived in {seconds / 60:.1f} minutes", flush=True)
+    """What the campaign found; the exit code. A fault that missed its run says nothing, and is told apart."""
+    struck = [row for row in rows if row["struck"]]
+    survived, kinds = sum(row["survived"] for row in struck), Counter(row["fault"] for row in struck)
+    missed = f", {len(rows) - len(struck)} more missed their runs" if len(struck) < len(rows) else ""
+    took = f"in {seconds / 60:.1f} minutes"
+    print(f"{survived} of {len(struck)} faults of {len(kinds)} kinds survived {took}{missed}", flush=True)
     if path is not None:
         path.write_text(json.dumps(rows, indent=1))
-    return 0 if rows and survived == len(rows) else 1
+    whole = all(row["survived"] or not (row["struck"] or row["told"]) for row in rows)
+    return 0 if struck and whole else 1
 
 
 if __name__ == "__main__":
