@@ -15,6 +15,7 @@ from pipelines.checkpoints import fitting
 from pipelines.rounds import Pace, run_rounds
 from pipelines.snapshot import Published, Snapshot
 from popgen.algos.xpm_wm.starts import Starts
+from popgen.config import PREFILL_CHUNK
 from popgen.data.sampler import Team
 from popgen.policies.simple import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 MEMBER = 1
 LEARNERS = ("model", "agent")
-PREFILL_CHUNK = 400
 PIECE = 100
 """World-model updates between two signs of progress."""
 

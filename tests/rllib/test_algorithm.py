@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -29,21 +28,7 @@ PPO = PpoConfig(
 CROSS = DiversityConfig(xp_envs=4, mp_envs=2, warmup=4, select_every=2, select_episodes=3, partner_random=0.0)
 SPEC = make_env(ENV.name, 1, **ENV.params).spec
 SOLO = Job(ENV, PPO, None, (1,), seed=1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cluster() -> Iterator[None]:
-    """A Ray of this module's own; its sockets need a short path."""
-    ray.init(
-        address="local",
-        num_cpus=2,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level="ERROR",
-        _temp_dir=tempfile.mkdtemp(prefix="pg-", dir="/tmp"),
-    )
-    yield
-    ray.shutdown()
+pytestmark = pytest.mark.usefixtures("cluster")
 
 
 def build(job: Job, **cluster: Any) -> Mappo:
@@ -59,7 +44,7 @@ def later(algorithm: Mappo, **options: Any) -> Job:
 
 
 @pytest.fixture(scope="module")
-def solo() -> Iterator[Mappo]:
+def solo(cluster: None) -> Iterator[Mappo]:
     algorithm = build(SOLO)
     yield algorithm
     algorithm.stop()
