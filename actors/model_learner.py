@@ -55,8 +55,11 @@ class ModelActor:
         sp, xp = ray.get(refs)
         return [a + b for a, b in zip(sp, xp, strict=True)]
 
-    def train(self, updates: int, starts_per_update: int) -> tuple[Weights, Starts | None, dict[str, float]]:
-        """`updates` gradient steps; weights, start states from the training windows, mean metrics."""
+    def train(
+        self, updates: int, starts_per_update: int, chosen: bool = True
+    ) -> tuple[Weights, Starts | None, dict[str, float]]:
+        """`updates` gradient steps; weights, start states from the training windows (with those that were chosen for
+        an event or without), mean metrics."""
         began, began_cpu = time.perf_counter(), time.process_time()
         config, learner = self.config.world_model, self.learner
         totals: dict[str, list[float]] = defaultdict(list)
@@ -72,7 +75,7 @@ class ModelActor:
                 for name, value in metrics.items():
                     totals[name].append(value)
                 if starts_per_update:
-                    starts.append(learner.starts(seen, windows, starts_per_update, pool=OLD))
+                    starts.append(learner.starts(seen, windows, starts_per_update, pool=OLD, chosen=chosen))
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["seconds"] = time.perf_counter() - began
         means["cpu_seconds"] = time.process_time() - began_cpu

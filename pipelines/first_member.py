@@ -119,7 +119,10 @@ class FirstMember:
     # ---- the rounds ------------------------------------------------------------------------------------------------
 
     def _learn_model(self, updates: int) -> tuple[Any, ...]:
-        return self.driver.crew.model.train.options(num_returns=3).remote(updates, self.config.agent.starts_sp)
+        """Imagination starts from chosen windows only once self-play has begun: before, the model does not know what
+        follows a rare event, and nothing corrects it."""
+        train, chosen = self.driver.crew.model.train, self.plays or self.phase.event_starts == "always"
+        return train.options(num_returns=3).remote(updates, self.config.agent.starts_sp, chosen)
 
     def _learn_agent(self) -> tuple[Any, ...]:
         """References to acting weights, critics, model and metrics."""

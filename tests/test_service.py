@@ -34,8 +34,9 @@ from popgen.preflight import check_kept
 ENTRY = ROOT / "docker" / "entrypoint.sh"
 BIN = Path(sys.executable).parent
 PARTS = ("popgen", "actors", "pipelines", "conf", "pyproject.toml", ".gitignore", ".rayignore")
+STEPS = 8000
 JOB = (
-    *("scale=smoke", "population.size=1", "env.params.horizon=40", "phase1.max_steps=4000", "evaluation.episodes=1"),
+    *("scale=smoke", "population.size=1", "env.params.horizon=40", f"phase1.max_steps={STEPS}", "evaluation.episodes=1"),
     *("seed=3", "cluster=nodes", "cluster.samplers=1", "cluster.sampler_cpus=0.1", "cluster.replay_cpus=0"),
     *("cluster.model_cpus=0.9", "cluster.agent_cpus=0.9", "cluster.model_gpus=0", "cluster.agent_gpus=0"),
     "cluster.threads=1",
@@ -214,14 +215,14 @@ def test_a_job_ends_with_exit_code_0_its_population_and_its_mlflow_run(
     assert len(load_population(unbroken / "population")) == 1
     told = describe_run(unbroken)
     assert (told["state"], told["member"], told["size"], told["error"]) == ("finished", 1, 1, None)
-    assert told["steps"]["random"] + told["steps"]["SP"] == 4000 and told["seconds"] > 0
+    assert told["steps"]["random"] + told["steps"]["SP"] == STEPS and told["seconds"] > 0
     client = MlflowClient(cluster.tracking)
     experiment = client.get_experiment_by_name("popgen")
     assert experiment is not None
     runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
     assert runs.keys() == {"unbroken", "unbroken/member_001"}
     assert {run.info.status for run in runs.values()} == {"FINISHED"}
-    assert runs["unbroken"].data.metrics["environment_steps_by_members"] == 4000
+    assert runs["unbroken"].data.metrics["environment_steps_by_members"] == STEPS
     there = {file.path for file in client.list_artifacts(runs["unbroken"].info.run_id)}
     assert there == {"config.json", "ledger.csv", "ledger.jsonl", "population", "report"}
     copy = client.download_artifacts(runs["unbroken"].info.run_id, "population", str(tmp_path))
@@ -255,6 +256,7 @@ def test_a_killed_job_submitted_again_ends_as_one_that_was_not(
     ledger = run / "ledger.jsonl"
     until("some work", lambda: ledger.exists() and ledger.read_bytes().count(b"\n") > 4, first)
     state = json.loads((run / "state.json").read_text())
+    os.kill(state["pid"], signal.SIGSTOP)  # it must not end while we look
     assert describe_run(run)["state"] == "running"
     # Another driver on the same run: refused before anything starts or changes.
     capsys.readouterr()
@@ -264,7 +266,7 @@ def test_a_killed_job_submitted_again_ends_as_one_that_was_not(
     out, _ = first.communicate(timeout=240)
     assert first.returncode == 1, out
     told = describe_run(run)
-    assert told["state"] == "interrupted" and 0 < told["total_steps"] < 4000
+    assert told["state"] == "interrupted" and 0 < told["total_steps"] < STEPS
     code, out = cluster.run("run.id=killed", tracking)
     assert code == 0 and "going on" in out, out
     assert entries(run) == entries(unbroken) and sha256s(run) == sha256s(unbroken)

@@ -42,7 +42,7 @@ class XpmSimConfig(Schema):
     episodes_sp: Batch = 4
     episodes_xp: Batch = 8
     updates_per_round: Positive = 5
-    updates: Positive = 55
+    updates: Positive = 75
     horizon: _Steps = 400
     restart_horizon: _Steps = 50
     xp_horizon: _Steps = 100
@@ -62,7 +62,7 @@ class XpmSimConfig(Schema):
     learning_rate: Rate = 2e-3
     entropy: Weight = 0.01
     grad_clip: Weight = 0.5
-    lambda_xp: Weight = 0.5
+    lambda_xp: Weight = 0.75
     lambda_ramp: NonNegative = 10
     lambda_until: Fraction = 1.0
     xp_clip: Weight = 0.0

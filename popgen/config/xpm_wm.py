@@ -81,7 +81,12 @@ class WorldModelConfig(Schema):
 
 
 class AgentConfig(Schema):
-    """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim)."""
+    """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim).
+
+    Every imagined batch is learned from in `epochs` passes of `minibatches`, with the `surrogate` `ppo` (clipped) or, in
+    one step, `reinforce`. Advantages are in units of their own standard deviation in self-play (`spread`) or of the
+    moving range of `return_percentiles` of self-play's `returns`.
+    """
 
     units: Width = 128
     layers: Layers = 2
@@ -93,16 +98,22 @@ class AgentConfig(Schema):
     starts_xp: Batch = 128
     discount: Fraction = 0.99
     lam: Fraction = 0.95
+    surrogate: Literal["ppo", "reinforce"] = "ppo"
+    epochs: Annotated[_Int, Field(ge=1, le=1000)] = 2
+    minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 12
+    clip: Rate = 0.2
+    advantage_unit: Literal["spread", "returns"] = "spread"
     actor_lr: Rate = 1e-3
     critic_lr: Rate = 1e-3
-    entropy: Weight = 3e-3
-    entropy_end: Weight = 5e-4
+    adam_eps: Rate = 1e-5
+    entropy: Weight = 0.02
+    entropy_end: Weight = 0.01
     entropy_after: Fraction = 0.5  # of a phase's target_score: the self-play at which the ramp begins
-    entropy_ramp: NonNegative = 1000
-    grad_clip: Weight = 100.0
+    entropy_ramp: NonNegative = 50
+    grad_clip: Weight = 0.5
     unimix: UniformShare = 0.01
     bins: Annotated[_Int, Field(ge=3, le=10_001)] = 65
-    slow_critic: Fraction = 0.98
+    slow_critic: Fraction = 0.0
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
     lambda_xp: Weight = 0.35
     lambda_start: Weight = 0.25
@@ -119,6 +130,15 @@ class AgentConfig(Schema):
         if not 0.0 <= low < high <= 100.0:
             problem = f"must be two ascending numbers within [0, 100] (got {low:g} and {high:g})"
             raise UserError("return_percentiles", problem, "choose 5 and 95")
+        return self
+
+    @model_validator(mode="after")
+    def _on_policy(self) -> AgentConfig:
+        if self.surrogate == "reinforce" and (self.epochs, self.minibatches) != (1, 1):
+            problem = "reinforce takes one step per batch: the second would no longer be on policy"
+            raise UserError("surrogate", problem, "set agent.epochs=1 and agent.minibatches=1")
+        if self.minibatches > self.horizon * min(self.starts_sp, self.starts_xp):
+            raise UserError("minibatches", "exceeds the samples of a batch", "lower it")
         return self
 
 
@@ -148,7 +168,11 @@ class ReplayConfig(Schema):
 
 
 class Phase1Config(Schema):
-    """Member 1: self-play together with the world model."""
+    """Member 1: self-play together with the world model.
+
+    event_starts: when imagination also starts from windows that were drawn for an event: once real self-play has passed
+        `agent.entropy_after` of the target, or always.
+    """
 
     envs: Batch = 64
     prefill_steps: Positive = 256_000
@@ -156,7 +180,8 @@ class Phase1Config(Schema):
     pretrain_updates: Positive = 1500
     steps_per_iteration: Positive = 100
     model_updates: Positive = 25
-    agent_updates: Positive = 25
+    agent_updates: Positive = 5
+    event_starts: Literal["playing", "always"] = "playing"
     recent_fraction: Fraction = 0.5
     recent_rows: Positive = 50_000
     max_steps: Positive = 680_000
@@ -170,8 +195,8 @@ class Phase1Config(Schema):
 class Phase2Config(Schema):
     """Members 2..M: mostly imagination, few real episodes."""
 
-    first_updates: Positive = 600
-    updates_per_round: Positive = 350
+    first_updates: Positive = 100
+    updates_per_round: Positive = 60
     model_updates: NonNegative = 100
     model_lr: Rate = 5e-4
     episodes_sp: Batch = 8

@@ -23,7 +23,8 @@ class Windows:
 
     obs (N, L, P, *shape) in the view's dtype; actions (N, L, P) int64, the joint action that led to the state;
     events (N, L, P, E) uint8 that it caused; is_first (N, L) bool; terminal (N, L) bool; partner (N,) int64,
-    the other member of a cross-play window, 0 elsewhere; kind (N,) int64, a KIND_CODE.
+    the other member of a cross-play window, 0 elsewhere; kind (N,) int64, a KIND_CODE; chosen (N,) bool: drawn for an
+    event that it contains.
     """
 
     obs: np.ndarray
@@ -33,6 +34,7 @@ class Windows:
     terminal: np.ndarray
     partner: np.ndarray
     kind: np.ndarray
+    chosen: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -202,8 +204,8 @@ class Replay:
         first, last = self.stream[np.where(inside, starts, 0)], self.stream[np.where(inside, starts + length - 1, 0)]
         return inside & (first == last) & (first >= 0)
 
-    def windows(self, starts: np.ndarray, length: int, view: str) -> Windows:
-        """Encode the windows that begin at rows `starts` (N,)."""
+    def windows(self, starts: np.ndarray, length: int, view: str, chosen: np.ndarray | None = None) -> Windows:
+        """Encode the windows that begin at rows `starts` (N,), of which `chosen` (N,) were drawn for an event."""
         index = starts[:, None] + np.arange(length)
         before = np.maximum(index - 1, 0)
         is_first = self.first[index].copy()
@@ -216,6 +218,7 @@ class Replay:
             terminal=self.terminal[index],
             partner=self.partner[starts].astype(np.int64),
             kind=self.kind[starts].astype(np.int64),
+            chosen=np.zeros(len(starts), bool) if chosen is None else chosen,
         )
 
     def state(self) -> dict[str, Any]:

@@ -34,7 +34,13 @@ def draw(replay: Replay, request: Request, length: int, view: str, turn: int = 0
         starts = replay.before_events(request.count, length, request.query, list(request.events), request.reach)
     else:
         starts = replay.sample(request.count, length, request.query, event_fraction=request.event_fraction, turn=turn)
-    return replay.windows(starts, length, view)
+    chosen = np.arange(len(starts)) < (len(starts) if request.events else by_event(request))
+    return replay.windows(starts, length, view, chosen)
+
+
+def by_event(request: Request) -> int:
+    """How many windows of a request are chosen for an event: the first ones."""
+    return int(round(request.count * request.event_fraction))
 
 
 def join(parts: list[Windows]) -> Windows:

@@ -6,17 +6,20 @@ J(j) = J_SP(j | starts in SP and XP states) - lambda_XP max_k J_XP(j, k | starts
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from popgen.algos.xpm_wm.samples import Samples
 from popgen.algos.xpm_wm.starts import Starts, draw_cross_play, draw_self_play
 from popgen.config import AgentConfig, WorldModelConfig
 from popgen.envs.base import EnvSpec
 from popgen.losses.actor_critic import ReturnScale, reinforce
 from popgen.losses.diversity import signed_advantage
+from popgen.losses.ppo import clipped_surrogate
 from popgen.losses.returns import lambda_return
 from popgen.nets import weights as w
 from popgen.nets.actor_critic import Actor, Critic
@@ -27,6 +30,9 @@ from popgen.world_model.model import WorldModel
 
 SELF = 0
 """Key of the self-play critic among the critics; cross-play critics are keyed by partner."""
+
+LEAST_SPREAD = 0.1
+"""Of self-play's advantages, in units of reward: where nothing is at stake, noise is not blown up."""
 
 
 def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) -> torch.dtype:  # noqa: B008
@@ -86,8 +92,9 @@ class AgentLearner:
         self.critics[str(key)] = Critic(self.config, self.model_config).to(self.device)
 
     def _make_optimisers(self) -> None:
-        self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), lr=self.config.actor_lr, eps=1e-8)
-        self.critic_optimiser = torch.optim.Adam(self.critics.parameters(), lr=self.config.critic_lr, eps=1e-8)
+        eps = self.config.adam_eps
+        self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), lr=self.config.actor_lr, eps=eps)
+        self.critic_optimiser = torch.optim.Adam(self.critics.parameters(), lr=self.config.critic_lr, eps=eps)
         self.rollout_actor = copy.deepcopy(self.actor).to(self.dtype).requires_grad_(False)
 
     def add_partner(self, member: int, actor_weights: w.Weights) -> None:
@@ -124,23 +131,24 @@ class AgentLearner:
         return max(members, key=lambda k: self.partner_scores[k])
 
     def update(self) -> dict[str, float]:
-        """Imagine, compute the XPM-Sim objective, and take one step of actor and critics."""
+        """Imagine, compute the XPM-Sim objective, and step actor and critics over the batch; mean figures."""
         partner = self.choose_partner()
         imagined, seats = self._imagine(partner)
         sp_rows = self.config.starts_sp
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16):
-            actor_loss, critic_loss, metrics = self._self_play_losses(_rows(imagined, slice(None, sp_rows)))
+        with self._autocast():
+            own, unit, figures = self._self_play(_rows(imagined, slice(None, sp_rows)))
+            samples = [own]
             if partner is not None:
-                cross = _rows(imagined, slice(sp_rows, None))
-                actor_xp, critic_xp, metrics_xp = self._cross_play_losses(cross, partner, seats)
-                actor_loss, critic_loss = actor_loss + actor_xp, critic_loss + critic_xp
-                metrics |= metrics_xp
-        self._step(self.actor_optimiser, actor_loss, self.actor.parameters())
-        self._step(self.critic_optimiser, critic_loss, self.critics.parameters())
+                cross, more = self._cross_play(_rows(imagined, slice(sp_rows, None)), partner, seats, unit)
+                samples, figures = [own, cross], figures | more
+        figures |= self._learn(samples)
         self._follow()
         self.updates += 1
         self.playing += self.plays
-        return metrics
+        return figures
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16)
 
     def _start_rows(self, rows: np.ndarray) -> Latent:
         starts = self.starts
@@ -204,63 +212,98 @@ class AgentLearner:
             returns = lambda_return(imagined.reward, value, self.config.discount * imagined.keep, self.config.lam)
         return returns, value
 
-    def _policy_terms(self, latent: Latent, seat: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Log-probability of the taken actions and entropy, both (H, B[, P])."""
-        log_probs = self.actor.log_probs(latent, seat)
-        taken = log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1)
-        return taken, -(log_probs.exp() * log_probs).sum(-1)
-
-    def _self_play_losses(self, imagined: Imagined) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def _self_play(self, imagined: Imagined) -> tuple[Samples, Tensor, dict[str, float]]:
+        """What self-play teaches, the unit of all advantages, and figures."""
         steps, batch = imagined.reward.shape
-        latent = imagined.latent[:-1]
-        seat = torch.zeros(steps + 1, batch, dtype=torch.long, device=self.device)
-        returns, value = self._targets(imagined, SELF, seat)
-        scale = self.scale.update(returns)
-        advantage = signed_advantage(Kind.SP, returns - value[:-1], weight=1.0, scale=scale)
-        pair = Latent(*(x.unsqueeze(2).expand(*x.shape[:2], 2, x.shape[-1]) for x in (latent.h, latent.z)))
-        both = torch.tensor([0, 1], device=self.device).expand(steps, batch, 2)
-        log_prob, entropy = self._policy_terms(pair, both, imagined.actions)
-        running = imagined.running.unsqueeze(-1)
-        actor_loss = reinforce(log_prob, advantage.unsqueeze(-1), entropy, running, entropy_scale=self.entropy_now())
-        critic_loss = (imagined.running * self.critics[str(SELF)].loss(latent, seat[:-1], returns)).mean()
-        metrics = {
-            "entropy": float(entropy.detach().mean()),
+        players = torch.tensor([0, 1], device=self.device).expand(batch, 2)
+        returns, value = self._targets(imagined, SELF, players[:, 0].expand(steps + 1, batch))
+        advantage, scale = returns - value[:-1], self.scale.update(returns)
+        unit = scale
+        if self.config.advantage_unit == "spread":  # centred as usual: a shift of all advantages only adds noise
+            running = advantage[imagined.running > 0.5]
+            advantage, unit = advantage - running.mean(), running.std().clamp(min=LEAST_SPREAD)
+        signed = signed_advantage(Kind.SP, advantage, weight=1.0, scale=unit)
+        figures = {
             "entropy_scale": self.entropy_now(),
             "return_scale": float(scale),
             "imagined_shaped_sp": float(imagined.reward.mean()),
             "imagined_return_sp": float(returns.mean()),
             "value_sp": float(value.mean()),
             "advantage_sp": float(advantage.std()),
-            "critic_loss_sp": float(critic_loss.detach()),
         }
-        return actor_loss, critic_loss, metrics
+        samples = Samples.of(imagined, SELF, players, returns, signed, self.entropy_now())
+        return self._with_log_probs(samples), unit, figures
 
-    def _cross_play_losses(
-        self, imagined: Imagined, partner: int, seats: Tensor
-    ) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def _cross_play(
+        self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor
+    ) -> tuple[Samples, dict[str, float]]:
+        """The same for cross-play, whose advantages enter with -lambda_XP in units of self-play's."""
         steps, batch = imagined.reward.shape
-        latent, seat = imagined.latent[:-1], seats.expand(steps, batch)
         returns, value = self._targets(imagined, partner, seats.expand(steps + 1, batch))
-        weight = self.lambda_now()
-        advantage = signed_advantage(Kind.XP, returns - value[:-1], weight=weight, scale=self.scale.value())
-        own = imagined.actions.gather(-1, seat.unsqueeze(-1)).squeeze(-1)
-        log_prob, entropy = self._policy_terms(latent, seat, own)
-        actor_loss = reinforce(
-            log_prob, advantage, entropy, imagined.running, entropy_scale=self.entropy_now() * weight
-        )
-        critic_loss = (imagined.running * self.critics[str(partner)].loss(latent, seat, returns)).mean()
+        advantage, weight = returns - value[:-1], self.lambda_now()
+        signed = signed_advantage(Kind.XP, advantage, weight=weight, scale=unit)
         reward = float(imagined.reward.mean())
         self.imagined_scores[partner] = 0.95 * self.imagined_scores.get(partner, reward) + 0.05 * reward
-        metrics = {
+        figures = {
             "imagined_shaped_xp": reward,
             "imagined_return_xp": float(returns.mean()),
             "advantage_xp": float(advantage.std()),
-            "critic_loss_xp": float(critic_loss.detach()),
+            "lambda": weight,
             "partner": float(partner),
         }
-        return actor_loss, critic_loss, metrics
+        samples = Samples.of(imagined, partner, seats.unsqueeze(-1), returns, signed, self.entropy_now() * weight)
+        return self._with_log_probs(samples), figures
 
-    def _step(self, optimiser: torch.optim.Optimizer, loss: Tensor, parameters: Any) -> None:
+    def _with_log_probs(self, samples: Samples) -> Samples:
+        """With those of the actions under the present policy, where the surrogate compares with them."""
+        if self.config.surrogate == "reinforce":
+            return samples
+        with torch.no_grad():
+            return replace(samples, log_prob=self._policy_terms(samples)[0])
+
+    def _policy_terms(self, samples: Samples) -> tuple[Tensor, Tensor]:
+        """Log-probability of the taken actions and entropy, both (R, K)."""
+        latent, seats = samples.latent, samples.seats
+        seen = Latent(*(x.unsqueeze(1).expand(*seats.shape, x.shape[-1]) for x in (latent.h, latent.z)))
+        log_probs = self.actor.log_probs(seen, seats)
+        taken = log_probs.gather(-1, samples.actions.unsqueeze(-1)).squeeze(-1)
+        return taken, -(log_probs.exp() * log_probs).sum(-1)
+
+    def _learn(self, samples: list[Samples]) -> dict[str, float]:
+        """`epochs` passes over the batch in `minibatches`, of every kind of samples its share; mean figures."""
+        config, totals = self.config, []
+        for _ in range(config.epochs):
+            parts = [part.split(config.minibatches, self.generator) for part in samples]
+            totals += [self._step(list(together)) for together in zip(*parts, strict=True)]
+        return {name: float(np.mean([figures[name] for figures in totals])) for name in totals[0]}
+
+    def _step(self, parts: list[Samples]) -> dict[str, float]:
+        """One step of the actor and of the critics that the samples are of."""
+        with self._autocast():
+            losses = [self._losses(part) for part in parts]
+        self._descend(self.actor_optimiser, sum(actor for actor, _, _ in losses), self.actor.parameters())
+        self._descend(self.critic_optimiser, sum(critic for _, critic, _ in losses), self.critics.parameters())
+        figures = losses[0][2]  # of the policy in self-play
+        for part, (_, critic, _) in zip(parts, losses, strict=True):
+            figures["critic_loss_sp" if part.key == SELF else "critic_loss_xp"] = float(critic.detach())
+        return figures
+
+    def _losses(self, samples: Samples) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Of the policy and of the critic, to be minimised, and the policy's figures."""
+        log_prob, entropy = self._policy_terms(samples)
+        advantage, running = samples.advantage.unsqueeze(-1), samples.running.unsqueeze(-1)
+        figures = {"entropy": float(entropy.detach().mean())}
+        if samples.log_prob is None:
+            policy = reinforce(log_prob, advantage, entropy, running, entropy_scale=samples.entropy_scale)
+        else:
+            surrogate = clipped_surrogate(log_prob, samples.log_prob, advantage, clip=self.config.clip)
+            policy = (running * (surrogate - samples.entropy_scale * entropy)).mean()
+            change = (log_prob.detach() - samples.log_prob).exp() - 1.0
+            figures["clipped"] = float((change.abs() > self.config.clip).float().mean())
+        critic = self.critics[str(samples.key)].loss(samples.latent, samples.seat, samples.returns)
+        return policy, (samples.running * critic).mean(), figures
+
+    def _descend(self, optimiser: torch.optim.Optimizer, loss: Any, parameters: Any) -> None:
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)

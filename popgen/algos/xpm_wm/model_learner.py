@@ -166,10 +166,15 @@ class ModelLearner:
         batch = Batch.of(windows, self.model)
         return self.model.observe(batch.obs, batch.actions, batch.is_first, self.generator)
 
-    def starts(self, seen: Observed, windows: Windows, count: int, *, pool: int, skip: int = 1) -> Starts:
-        """`count` random states of the windows, neither terminal nor among the first `skip` of their window."""
+    def starts(
+        self, seen: Observed, windows: Windows, count: int, *, pool: int, skip: int = 1, chosen: bool = True
+    ) -> Starts:
+        """`count` random states of the windows, neither terminal nor among the first `skip` of their window; with
+        `chosen` false, none of a window that was drawn for an event."""
         allowed = ~np.ascontiguousarray(windows.terminal.T)
         allowed[:skip] = False
+        if not chosen:
+            allowed[:, windows.chosen] = False
         steps, rows = np.nonzero(allowed)
         picked = self.rng.integers(0, len(steps), size=count)
         t, b = steps[picked], rows[picked]
