@@ -107,7 +107,7 @@ class AgentConfig(Schema):
     critic_lr: Rate = 1e-3
     adam_eps: Rate = 1e-5
     entropy: Weight = 0.02
-    entropy_end: Weight = 0.01
+    entropy_end: Weight = 0.02
     entropy_after: Fraction = 0.5  # of a phase's target_score: the self-play at which the ramp begins
     entropy_ramp: NonNegative = 50
     grad_clip: Weight = 0.5
@@ -117,7 +117,7 @@ class AgentConfig(Schema):
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
     lambda_xp: Weight = 0.35
     lambda_start: Weight = 0.25
-    lambda_ramp: NonNegative = 2000
+    lambda_ramp: NonNegative = 100
     sp_from_xp: Fraction = 0.5
     xp_starts: Literal["partner", "any"] = "partner"
     partner: Literal["max_window", "max_buffer"] = "max_window"
