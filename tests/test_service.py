@@ -36,7 +36,13 @@ BIN = Path(sys.executable).parent
 PARTS = ("popgen", "actors", "pipelines", "conf", "pyproject.toml", ".gitignore", ".rayignore")
 STEPS = 8000
 JOB = (
-    *("scale=smoke", "population.size=1", "env.params.horizon=40", f"phase1.max_steps={STEPS}", "evaluation.episodes=1"),
+    *(
+        "scale=smoke",
+        "population.size=1",
+        "env.params.horizon=40",
+        f"phase1.max_steps={STEPS}",
+        "evaluation.episodes=1",
+    ),
     *("seed=3", "cluster=nodes", "cluster.samplers=1", "cluster.sampler_cpus=0.1", "cluster.replay_cpus=0"),
     *("cluster.model_cpus=0.9", "cluster.agent_cpus=0.9", "cluster.model_gpus=0", "cluster.agent_gpus=0"),
     "cluster.threads=1",

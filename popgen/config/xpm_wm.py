@@ -83,9 +83,9 @@ class WorldModelConfig(Schema):
 class AgentConfig(Schema):
     """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim).
 
-    Every imagined batch is learned from in `epochs` passes of `minibatches`, with the `surrogate` `ppo` (clipped) or, in
-    one step, `reinforce`. Advantages are in units of their own standard deviation in self-play (`spread`) or of the
-    moving range of `return_percentiles` of self-play's `returns`.
+    Every imagined batch is learned from in `epochs` passes of `minibatches`, with the `surrogate` `ppo` (clipped) or,
+    in one step, `reinforce`. Advantages are in units of their own standard deviation in self-play (`spread`) or of
+    the moving range of `return_percentiles` of self-play's `returns`.
     """
 
     units: Width = 128

@@ -72,7 +72,11 @@ def split(imagined: list[Imagined]) -> Imagined:
 ROWS = 240
 PPO = {"surrogate": "ppo", "epochs": 2, "minibatches": 4}
 REINFORCE = {
-    "surrogate": "reinforce", "epochs": 1, "minibatches": 1, "advantage_unit": "returns", "slow_critic": 0.98,
+    "surrogate": "reinforce",
+    "epochs": 1,
+    "minibatches": 1,
+    "advantage_unit": "returns",
+    "slow_critic": 0.98,
 }
 SEATS = (torch.arange(ROWS) >= ROWS // 2).long()
 
@@ -169,12 +173,12 @@ def test_without_a_ramp_the_entropy_scale_stays() -> None:
 
 
 def test_updates_count_for_the_entropy_scale_only_once_self_play_has_started() -> None:
-    learner = make_learner(entropy_ramp=4)
+    learner = make_learner(entropy_ramp=4, entropy_end=1e-3)
     for learner.plays, wanted in ((False, 0), (True, 1), (True, 2)):
         learner.update()
         assert learner.playing == wanted
     state = learner.state()
-    other = make_learner(entropy_ramp=4)
+    other = make_learner(entropy_ramp=4, entropy_end=1e-3)
     other.load_state(state)
     assert other.playing == 2 and other.entropy_now() == learner.entropy_now() < learner.config.entropy
 
@@ -381,3 +385,33 @@ def test_update_needs_starts() -> None:
     learner = AgentLearner(AGENT, MODEL, SPEC, member=1, seed=0)
     with pytest.raises(RuntimeError, match="set_starts"):
         learner.update()
+
+
+@pytest.mark.parametrize("key", [0, 1], ids=["self-play", "cross-play"])
+def test_the_first_step_of_ppo_is_that_of_reinforce(key: int) -> None:
+    """At a ratio of one, d/dtheta (pi / pi_old) A = A d/dtheta ln pi."""
+    gradients = []
+    for surrogate in ("ppo", "reinforce"):
+        learner = make_learner(surrogate=surrogate, epochs=1, minibatches=1, entropy=0.01)
+        given = trajectories(ROWS, lambda a: (a[..., 0] == 2).float(), seed=3)
+        samples = learner._self_play(given) if key == 0 else learner._cross_play(given, 1, SEATS, torch.ones(()))
+        assert (samples[0].log_prob is None) == (surrogate == "reinforce")
+        learner._losses(samples[0])[0].backward()
+        gradients.append(torch.cat([parameter.grad.flatten() for parameter in learner.actor.parameters()]))
+    torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-4)
+    assert gradients[0].abs().max() > 1e-3
+
+
+def test_self_plays_advantages_are_centred_and_in_units_of_their_spread() -> None:
+    learner = make_learner(surrogate="ppo", advantage_unit="spread")
+    given = trajectories(ROWS, lambda a: 7.0 * (a[..., 0] == 2).float() + 3.0)
+    samples, unit, figures = learner._self_play(given)
+    assert float(samples.advantage.mean()) == pytest.approx(0.0, abs=1e-5)
+    assert float(samples.advantage.std()) == pytest.approx(1.0, rel=1e-4)
+    assert float(unit) == pytest.approx(figures["advantage_sp"]) == pytest.approx(float(given.reward.std()))
+
+
+def test_where_nothing_is_at_stake_noise_is_not_blown_up() -> None:
+    learner = make_learner(surrogate="ppo", advantage_unit="spread")
+    samples, unit, _ = learner._self_play(trajectories(ROWS, lambda a: 1e-4 * a[..., 0]))
+    assert float(unit) == pytest.approx(0.1) and samples.advantage.abs().max() < 0.01

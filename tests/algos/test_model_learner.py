@@ -230,6 +230,15 @@ def test_starts_are_posterior_states_that_are_neither_terminal_nor_first() -> No
     assert places == {(t, b) for t in (2, 3, 4) for b in range(6)} - {(2, 1), (4, 4)}
 
 
+def test_starts_can_leave_out_the_windows_that_were_chosen_for_an_event() -> None:
+    learner, windows = make_learner(), crossed(random_windows(6, 5), PARTNERS)
+    windows.chosen[[0, 3, 5]] = True
+    seen = learner.posteriors(windows)
+    for chosen, wanted in ((True, {0, 1, 2, 3, 4, 5}), (False, {1, 2, 4})):
+        starts = learner.starts(seen, windows, 300, pool=0, chosen=chosen)
+        assert {int(np.argwhere((seen.latent.h.numpy() == h).all(-1))[0, 1]) for h in starts.h} == wanted
+
+
 def rigged(learner: ModelLearner) -> None:
     """A model that predicts event 0 of player 0 and event 2 of player 1, always."""
     with torch.no_grad():

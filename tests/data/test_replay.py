@@ -353,7 +353,10 @@ def test_requests() -> None:
     third = draw(replay, Request(Query(owner=2), 6, events=(1,), reach=2), 3, "numbers")
     assert first and second and third
     assert second.events[0, 1:, :, 1].any() and second.events[1, 1:, :, 2].any()
+    half = draw(replay, Request(Query(), 6, event_fraction=0.5), 3, "numbers")
+    assert half is not None and half.chosen.tolist() == [True] * 3 + [False] * 3
     joined = join([first, second, third])
+    assert joined.chosen.tolist() == [False] * 4 + [True] * 11
     assert joined.kind.tolist() == [KIND_CODE[Kind.SP]] * 4 + [KIND_CODE[Kind.XP]] * 11
     assert joined.partner.tolist() == [0] * 4 + [1] * 11
     assert np.array_equal(joined.obs[4:9], second.obs) and joined.obs.shape == (15, 3, 2, 2)

@@ -74,3 +74,18 @@ def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_targ
     assert first.plays
     play(first, *[0.0] * 16)
     assert first.plays  # for good
+
+
+@pytest.mark.parametrize(
+    ("event_starts", "plays", "chosen"), [("playing", False, False), ("playing", True, True), ("always", False, True)]
+)
+def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
+    event_starts: str, plays: bool, chosen: bool
+) -> None:
+    asked = []
+    train = SimpleNamespace(options=lambda num_returns: SimpleNamespace(remote=lambda *given: asked.append(given)))
+    first = member(event_starts=event_starts)
+    first.driver.crew = SimpleNamespace(model=SimpleNamespace(train=train))  # type: ignore[misc]
+    first.plays = plays
+    first._learn_model(7)
+    assert asked == [(7, first.config.agent.starts_sp, chosen)]
