@@ -18,6 +18,7 @@ from actors.common import build_env, settle
 from pipelines.books import Books, named, run_folder
 from pipelines.crew import start_ray
 from pipelines.report import write_run_figures
+from pipelines.runs import RunState
 from pipelines.survival import Patience, death, first_line, nodes_alive, told, wait_for_room
 from pipelines.watch import LoggingReporter, gauge
 from popgen.config import RunConfig
@@ -82,8 +83,10 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
     settle(config.cluster.threads)
     spec = build_env(config.env, 1).spec
     config = named(config)
-    if config.run.storage and (restored := Mirror(run_folder(config), config.run.storage).pull()):
-        reporter.note(restored)
+    if config.run.storage:
+        RunState.check_free(run_folder(config))  # the copy would be put in place of what its driver writes to
+        if restored := Mirror(run_folder(config), config.run.storage).pull():
+            reporter.note(restored)
     books = Books(config, spec)
     reporter.note(f"run {books.run_id} in {books.dir}")
     job = _Job(config, spec, books, reporter)

@@ -55,6 +55,16 @@ class RunState:
         self._file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         self._file.flush()
 
+    @staticmethod
+    def check_free(folder: Path) -> None:
+        """Nobody is at work on this run, whose folder need not be there yet.
+
+        Raises:
+            UserError: another driver is.
+        """
+        if (folder / LOCK).exists():
+            RunState(folder)._file.close()
+
     def start(self, attempt: int) -> None:
         """The attempt begins."""
         try:

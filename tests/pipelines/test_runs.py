@@ -15,11 +15,14 @@ import pytest
 from conftest import ROOT
 
 from pipelines import runs
+from pipelines.population import run_population
 from pipelines.runs import RunState, describe_run, list_runs
 from popgen import cli
 from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
+from popgen.data.storage import MARK, Mirror
 from popgen.errors import UserError
+from popgen.progress import NullReporter
 from popgen.types import Kind, LedgerEntry
 
 HOLD = "import sys; from pathlib import Path; from pipelines.runs import RunState; state = RunState(Path(sys.argv[1]))"
@@ -62,6 +65,25 @@ def test_a_living_driver_is_seen_and_keeps_others_out(folder: Path, elsewhere: A
     with pytest.raises(UserError, match=rf"first is being run by process {elsewhere.pid} on {socket.gethostname()}"):
         RunState(folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
+
+
+def test_a_copy_elsewhere_does_not_replace_the_folder_of_a_living_driver(folder: Path, elsewhere: Any) -> None:
+    copy = folder.parent / "storage"
+    Mirror(folder, copy.as_uri()).push()
+    (folder / MARK).unlink()  # so that the copy is another machine's
+    config = RunConfig.parse(
+        {
+            "env": {"name": "rendezvous/mppmr"},
+            "run": {"root": str(folder.parent), "id": folder.name, "storage": copy.as_uri()},
+        }
+    )
+    with pytest.raises(UserError, match=f"first is being run by process {elsewhere.pid}"):
+        run_population(config, reporter=NullReporter())
+    assert not (folder / MARK).exists() and [p.name for p in folder.parent.iterdir()].count("first.stale0") == 0
+    elsewhere.kill()
+    elsewhere.wait()
+    RunState.check_free(folder)
+    RunState.check_free(folder.parent / "none")
 
 
 def test_a_driver_that_is_killed_leaves_an_interrupted_run_that_can_be_taken_up(folder: Path, elsewhere: Any) -> None:
