@@ -1,6 +1,8 @@
 """One member's learner: imagined self-play and cross-play, and the XPM-Sim objective (paper, eq. XPM-Sim).
 
 J(j) = J_SP(j | starts in SP and XP states) - lambda_XP max_k J_XP(j, k | starts in XP states)
+
+By REINFORCE, as in the paper, or by PPO's clipped surrogate in several passes over what was imagined.
 """
 
 from __future__ import annotations
@@ -48,8 +50,8 @@ class AgentLearner:
     """Actor, one self-play critic and one cross-play critic per partner of member `member`.
 
     Set the world model, start states and partners, then call `update`; set `plays` as soon as real self-play has
-    started. All tensors are on `device`; weights come and
-    go as arrays. What the generators give differs between kinds of devices, initial weights do not.
+    started. All tensors are on `device`; weights come and go as arrays. What the generators give differs between kinds
+    of devices, initial weights do not.
     """
 
     def __init__(
@@ -170,7 +172,7 @@ class AgentLearner:
         """Entropy scale of this update: `entropy` until self-play has started, then falling to `entropy_end` within
         `entropy_ramp` updates, by the same factor in each.
 
-        Advantages are divided by the spread of returns, which grows tenfold once dishes are delivered: a scale that
+        In units of the returns' range, which grows tenfold once dishes are delivered, advantages shrink: a scale that
         lets self-play start would then win over them, and the policy would get more random the better it plays.
         """
         config = self.config
