@@ -197,8 +197,8 @@ class Phase2Config(Schema):
 
     first_updates: Positive = 100
     updates_per_round: Positive = 60
-    model_updates: NonNegative = 100
-    model_lr: Rate = 5e-4
+    model_updates: NonNegative = 300
+    model_lr: Rate = 1e-3
     episodes_sp: Batch = 8
     episodes_xp: Batch = 8
     rounds: Positive = 8
