@@ -27,6 +27,8 @@ MEMBER = 1
 LEARNERS = ("model", "agent")
 PIECE = 100
 """World-model updates between two signs of progress."""
+CONFIRMED = 0.97
+"""Share of the target that the last policy must reach by itself."""
 
 
 class FirstMember:
@@ -44,7 +46,8 @@ class FirstMember:
         self.figures: dict[str, float] = {}
         self.rounds = self.since_best = 0
         self.top: Snapshot | None = None
-        self.restarted = self.plays = False
+        self.restarted = self.plays = self.confirmed = False
+        self.confirmations = 0
         self.busy: Counter[str] = Counter()
         self.cpu: Counter[str] = Counter()
         self.report: Any = None
@@ -69,16 +72,19 @@ class FirstMember:
                 crew.players.load_state(saved["samplers"])
         checkpoints, work = self.driver.checkpoints, self._work()
         self.pace, self.began = Pace(work, LEARNERS, self.config.run.overlap), time.perf_counter()
-        run_rounds(
-            work,
-            stop=self._stop,
-            after=self._after,
-            schedule=self.config.run.schedule,
-            due=checkpoints.due,
-            save=self._save,
-            pace=self.pace,
-        )
-        return self._best()
+        while True:
+            run_rounds(
+                work,
+                stop=self._stop,
+                after=self._after,
+                schedule=self.config.run.schedule,
+                due=checkpoints.due,
+                save=self._save,
+                pace=self.pace,
+            )
+            if not self._reached() or self._confirm():
+                return self._best()
+            self._sit_down()
 
     # ---- before the rounds -----------------------------------------------------------------------------------------
 
@@ -112,9 +118,11 @@ class FirstMember:
         self.published, info = self._publish(self._learn_agent())
         ray.get(info)
 
-    def _sit_down(self) -> None:
+    def _sit_down(self, stagger: bool = True) -> None:
+        """Fresh episodes of the published policy."""
         parts = {MEMBER: self.driver.parts(ray.get(self.published.acting))}
-        self.driver.crew.players.open([Team(Kind.SP, (MEMBER, MEMBER), self.phase.envs)], parts, self.seed, True)
+        seed = self.seed + 10_000 * (2 * self.confirmations - (not stagger))
+        self.driver.crew.players.open([Team(Kind.SP, (MEMBER, MEMBER), self.phase.envs)], parts, seed, stagger)
 
     # ---- the rounds ------------------------------------------------------------------------------------------------
 
@@ -228,15 +236,41 @@ class FirstMember:
             self.published, info = self._publish(self._learn_agent())
             ray.get(info)
 
+    def _reached(self) -> bool:
+        """The target, over a full window of episodes."""
+        return self._full and float(np.mean(self.recent)) >= self.phase.target_score
+
     def _stop(self) -> bool:
-        """Budget spent, target reached over a full window of episodes, or no better for `patience` rounds."""
-        reached = self._full and float(np.mean(self.recent)) >= self.phase.target_score
-        return self.driver.steps >= self.phase.max_steps or reached or self.since_best >= self.phase.patience
+        """Budget spent, target reached, or no better for `patience` rounds."""
+        spent = self.driver.steps >= self.phase.max_steps
+        return spent or self._reached() or self.since_best >= self.phase.patience
+
+    def _confirm(self) -> bool:
+        """Whether the last policy is good by itself: one whole episode of it in each environment, counted as all others.
+
+        What the window holds was played by several policies, of which the last can be the worse. Where the budget
+        leaves no room for it, the window must do.
+        """
+        driver, horizon = self.driver, self.driver.spec.horizon
+        if driver.steps + self.phase.envs * horizon > self.phase.max_steps:
+            return True
+        self.confirmations += 1
+        self._sit_down(stagger=False)
+        episodes = driver.play(MEMBER, horizon)
+        self.recent.extend(e.score for e in episodes)
+        self.shaped.extend(e.shaped for e in episodes)
+        score = float(np.mean([e.score for e in episodes]))
+        self.confirmed = score >= CONFIRMED * self.phase.target_score
+        outcome = "taken" if self.confirmed else "learning goes on"
+        driver.reporter.note(
+            f"member 1: {score:.2f} {driver.spec.score_name} in {len(episodes)} episodes of one policy: {outcome}"
+        )
+        return self.confirmed
 
     def _best(self) -> Snapshot:
         """The weights with the best window, unless the last ones are about as good (they learned longer)."""
         last = Snapshot(self.published, float(np.mean(self.recent)) if self.recent else 0.0, 0.0)
-        return last if self.top is None or last.sp >= 0.95 * self.top.sp else self.top
+        return last if self.confirmed or self.top is None or last.sp >= 0.95 * self.top.sp else self.top
 
     # ---- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -250,7 +284,7 @@ class FirstMember:
             "recent": list(self.recent),
             "shaped": list(self.shaped),
             "figures": dict(self.figures),
-            "counters": [self.rounds, self.since_best, self.restarted, self.plays],
+            "counters": [self.rounds, self.since_best, self.restarted, self.plays, self.confirmations],
         }
         self.driver.save(MEMBER, self.rounds, {"first_member": state, "samplers": self.driver.crew.players.state()})
 
@@ -260,4 +294,4 @@ class FirstMember:
         self.recent.extend(state["recent"])
         self.shaped.extend(state["shaped"])
         self.figures = dict(state["figures"])
-        self.rounds, self.since_best, self.restarted, self.plays = state["counters"]
+        self.rounds, self.since_best, self.restarted, self.plays, self.confirmations = state["counters"]

@@ -89,3 +89,45 @@ def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
     first.plays = plays
     first._learn_model(7)
     assert asked == [(7, first.config.agent.starts_sp, chosen)]
+
+
+class Alone:
+    """A driver whose players give these scores in one episode each, one list for each time they are asked."""
+
+    def __init__(self, config: RunConfig, *scores: list[float], steps: int = 0) -> None:
+        self.config, self.scores, self.steps = config, list(scores), steps
+        self.spec = SimpleNamespace(horizon=10, score_name="dishes")
+        self.reporter, self.seeds = SimpleNamespace(note=lambda text: None), []
+        players = SimpleNamespace(open=lambda teams, parts, seed, stagger: self.seeds.append((seed, stagger)))
+        self.crew = SimpleNamespace(players=players)
+
+    def parts(self, acting: Any) -> Any:
+        return acting
+
+    def play(self, member: int, steps: int) -> list[Any]:
+        assert (member, steps) == (1, 10)
+        self.steps += steps * 16
+        return [SimpleNamespace(score=score, shaped=0.0) for score in self.scores.pop(0)]
+
+
+def test_the_last_policy_must_reach_the_target_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """9.69 of 10 is too little, 9.7 enough; every look has fresh episodes, and play between them too."""
+    monkeypatch.setattr("pipelines.first_member.ray.get", lambda reference: reference)
+    first = member(target_score=10.0, max_steps=10_000)
+    first.published = SimpleNamespace(acting=None)  # type: ignore[assignment]
+    first.driver = driver = Alone(first.config, [9.69] * 16, [9.7] * 16)  # type: ignore[assignment]
+    play(first, *[10.1] * 16)
+    assert first._reached() and not first._confirm() and not first._reached()
+    first._sit_down()
+    play(first, *[10.1] * 16)
+    assert first._reached() and first._confirm()
+    assert first._best().published is first.published and first._best().sp == pytest.approx(9.7)
+    assert driver.steps == 320 and [stagger for _, stagger in driver.seeds] == [False, True, False]
+    assert len({seed for seed, _ in driver.seeds}) == 3
+
+
+def test_without_room_in_the_budget_the_window_must_do() -> None:
+    first = member(target_score=10.0, max_steps=1000)
+    first.driver = Alone(first.config, steps=841)  # type: ignore[assignment]
+    play(first, *[10.1] * 16)
+    assert first._confirm() and first.confirmations == 0
