@@ -262,9 +262,8 @@ class FirstMember:
         score = float(np.mean([e.score for e in episodes]))
         self.confirmed = score >= CONFIRMED * self.phase.target_score
         outcome = "taken" if self.confirmed else "learning goes on"
-        driver.reporter.note(
-            f"member 1: {score:.2f} {driver.spec.score_name} in {len(episodes)} episodes of one policy: {outcome}"
-        )
+        told = f"{score:.2f} {driver.spec.score_name} in {len(episodes)} episodes of one policy: {outcome}"
+        driver.reporter.note(f"member 1: {told}")
         return self.confirmed
 
     def _best(self) -> Snapshot:
