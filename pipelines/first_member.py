@@ -246,7 +246,7 @@ class FirstMember:
         return spent or self._reached() or self.since_best >= self.phase.patience
 
     def _confirm(self) -> bool:
-        """Whether the last policy is good by itself: one whole episode of it in each environment, counted as all others.
+        """Whether the last policy is good by itself: a whole episode of it in each environment, counted as all others.
 
         What the window holds was played by several policies, of which the last can be the worse. Where the budget
         leaves no room for it, the window must do.
