@@ -55,6 +55,11 @@ class Query:
     last: int | None = None
 
 
+def by_event(batch: int, event_fraction: float) -> int:
+    """How many of a batch of windows are chosen for an event: the first ones."""
+    return int(round(batch * event_fraction))
+
+
 class Replay:
     """A ring buffer of transitions.
 
@@ -159,7 +164,7 @@ class Replay:
             LookupError: no window of that length matches.
         """
         starts = self._draw(self.rows(query), batch, length, offset=0)
-        for slot in range(int(round(batch * event_fraction))):
+        for slot in range(by_event(batch, event_fraction)):
             event = (turn + slot) % self.env.spec.num_events
             found = self.rows(query, event)
             if len(found):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from popgen.data.replay import Query, Replay, Windows
+from popgen.data.replay import Query, Replay, Windows, by_event
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,10 @@ def draw(replay: Replay, request: Request, length: int, view: str, turn: int = 0
         starts = replay.before_events(request.count, length, request.query, list(request.events), request.reach)
     else:
         starts = replay.sample(request.count, length, request.query, event_fraction=request.event_fraction, turn=turn)
-    chosen = np.arange(len(starts)) < (len(starts) if request.events else by_event(request))
+    chosen = np.arange(len(starts)) < (
+        len(starts) if request.events else by_event(request.count, request.event_fraction)
+    )
     return replay.windows(starts, length, view, chosen)
-
-
-def by_event(request: Request) -> int:
-    """How many windows of a request are chosen for an event: the first ones."""
-    return int(round(request.count * request.event_fraction))
 
 
 def join(parts: list[Windows]) -> Windows:

@@ -17,6 +17,21 @@ def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor,
     return -torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
+def clipped_loss(
+    log_prob: Tensor,
+    old_log_prob: Tensor,
+    advantage: Tensor,
+    entropy: Tensor,
+    weight: Tensor,
+    *,
+    clip: float,
+    entropy_scale: float,
+) -> Tensor:
+    """Policy loss with the entropy bonus, to be minimised: the mean of w (surrogate - eta H[pi])."""
+    surrogate = clipped_surrogate(log_prob, old_log_prob, advantage, clip=clip)
+    return (weight * (surrogate - entropy_scale * entropy)).mean()
+
+
 def negated_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, *, clip: float) -> Tensor:
     """+min(r A, clip(r) A): what two published code bases minimise for cross-play, kept to reproduce their numbers.
 

@@ -25,7 +25,7 @@ from popgen.config import XpmSimConfig
 from popgen.envs.base import BatchedEnv, EnvSpec
 from popgen.losses.actor_critic import reinforce
 from popgen.losses.diversity import signed_advantage
-from popgen.losses.ppo import clipped_surrogate
+from popgen.losses.ppo import clipped_loss
 from popgen.nets import weights as w
 from popgen.nets.feed_forward import Sizes, ValueNet, joint, orthogonal
 from popgen.nets.vae import latent_view
@@ -259,8 +259,8 @@ class XpmSimLearner:
         if config.surrogate == "reinforce":
             loss = reinforce(log_prob, part.advantage, entropy, part.weight, entropy_scale=config.entropy)
         else:
-            surrogate = clipped_surrogate(log_prob, part.log_prob, part.advantage, clip=config.clip)
-            loss = (part.weight * (surrogate - config.entropy * entropy)).mean()
+            given = (log_prob, part.log_prob, part.advantage, entropy, part.weight)
+            loss = clipped_loss(*given, clip=config.clip, entropy_scale=config.entropy)
         self._step(self.actor_optimiser, loss, self.trained)
         with torch.no_grad():
             change = log_prob - part.log_prob

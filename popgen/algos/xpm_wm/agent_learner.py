@@ -21,7 +21,7 @@ from popgen.config import AgentConfig, WorldModelConfig
 from popgen.envs.base import EnvSpec
 from popgen.losses.actor_critic import ReturnScale, reinforce
 from popgen.losses.diversity import signed_advantage
-from popgen.losses.ppo import clipped_surrogate
+from popgen.losses.ppo import clipped_loss
 from popgen.losses.returns import lambda_return
 from popgen.nets import weights as w
 from popgen.nets.actor_critic import Actor, Critic
@@ -298,8 +298,8 @@ class AgentLearner:
         if samples.log_prob is None:
             policy = reinforce(log_prob, advantage, entropy, running, entropy_scale=samples.entropy_scale)
         else:
-            surrogate = clipped_surrogate(log_prob, samples.log_prob, advantage, clip=self.config.clip)
-            policy = (running * (surrogate - samples.entropy_scale * entropy)).mean()
+            given = (log_prob, samples.log_prob, advantage, entropy, running)
+            policy = clipped_loss(*given, clip=self.config.clip, entropy_scale=samples.entropy_scale)
             change = (log_prob.detach() - samples.log_prob).exp() - 1.0
             figures["clipped"] = float((change.abs() > self.config.clip).float().mean())
         critic = self.critics[str(samples.key)].loss(samples.latent, samples.seat, samples.returns)

@@ -170,10 +170,10 @@ class ModelLearner:
         self, seen: Observed, windows: Windows, count: int, *, pool: int, skip: int = 1, chosen: bool = True
     ) -> Starts:
         """`count` random states of the windows, neither terminal nor among the first `skip` of their window; with
-        `chosen` false, none of a window that was drawn for an event."""
+        `chosen` false, none of a window that was drawn for an event, if there are others."""
         allowed = ~np.ascontiguousarray(windows.terminal.T)
         allowed[:skip] = False
-        if not chosen:
+        if not chosen and not windows.chosen.all():
             allowed[:, windows.chosen] = False
         steps, rows = np.nonzero(allowed)
         picked = self.rng.integers(0, len(steps), size=count)
