@@ -8,24 +8,31 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import ray
+import torch
+
 from pipelines.books import Books
-from popgen.config import RunConfig
-from popgen.data.checkpoint import load_state, save_state
+from pipelines.checkpoints import Checkpoints, finished_member, fitting, member_folder
+from popgen.config import ClusterConfig, RunConfig
+from popgen.data.checkpoint import save_state
 from popgen.envs.base import EnvSpec
+from popgen.errors import UserError
 from popgen.nets.weights import Weights
 from popgen.policies.feed_forward import FeedForwardPolicy
 from popgen.population import load_population
+from popgen.preflight import memory_bytes
 from popgen.progress import Reporter
 from popgen.rllib.algorithm import Mappo as Algorithm
 from popgen.rllib.algorithm import MappoConfig, Report
 from popgen.rllib.job import Job, policy_config
 from popgen.types import LedgerEntry
 
-NEVER_GIVEN = ("sp", "xp")
-"""Figures that an iteration may lack, since no episode has ended."""
+SCORES = ("sp", "xp")
+"""Figures of whole episodes, `real_...` in the metrics; an iteration lacks them until some have ended."""
 
 
 class Baseline:
@@ -36,9 +43,7 @@ class Baseline:
 
     def __init__(self, config: RunConfig, spec: EnvSpec, books: Books, reporter: Reporter) -> None:
         self.config, self.spec, self.books, self.reporter = config, spec, books, reporter
-        self.folder = books.dir / "checkpoints"
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.saved = time.monotonic()
+        self.checkpoints = Checkpoints(books.dir, long=1, seconds=config.run.checkpoint_seconds)
         self.sequence = 0
 
     @property
@@ -49,15 +54,24 @@ class Baseline:
     # ---- the walk ------------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Train every member that is not there yet."""
+        """Train every member that is not there yet.
+
+        Raises:
+            UserError: the machine or the cluster has not what the training needs, or no checkpoint is whole.
+        """
         size = self.config.population.size
         first, saved = self._resume()
         while first <= size:
             last = size if self.concurrent else first
+            if saved is None:
+                self.checkpoints.begin(None)
             # Members that learn together are added together; an interruption may have left some of them to add.
-            begin = 1 if self.concurrent else first
-            self._train(tuple(range(begin, last + 1)), first, saved)
+            self._train(tuple(range(self._begin(first), last + 1)), first, saved)
             first, saved = last + 1, None
+
+    def _begin(self, first: int) -> int:
+        """The first of the members that learn together with `first`."""
+        return 1 if self.concurrent else first
 
     def job(self, learning: tuple[int, ...]) -> Job:
         """What RLlib is to train."""
@@ -72,18 +86,21 @@ class Baseline:
             learning=learning,
             seed=config.run.seed * 1000 + learning[0],
             frozen=frozen,
-            mixed=self.mixed,
+            mixed=self.mixed and config.diversity.lambda_mp > 0.0,
             fresh=self.mixed,
         )
 
     def _train(self, learning: tuple[int, ...], first: int, saved: dict[str, Any] | None) -> None:
         """Train `learning`, then add its members from `first` on."""
-        algorithm = MappoConfig.of(self.job(learning), self.spec, self.config.cluster).build_algo()
+        job, cluster = self.job(learning), self.config.cluster
+        check_needs(job, self.spec, cluster, self.reporter.note)
+        algorithm = MappoConfig.of(job, self.spec, cluster).build_algo()
         try:
             began = time.time()
             if saved is not None:
-                algorithm.resume(saved["algorithm"])
-                self.sequence, began = int(saved["sequence"]), began - float(saved["seconds"])
+                with fitting(self.checkpoints.folder):
+                    algorithm.resume(saved["algorithm"])
+                    self.sequence, began = int(saved["sequence"]), began - float(saved["seconds"])
             names = f"member {learning[0]}" + (f" to {learning[-1]}" if len(learning) > 1 else "")
             self.reporter.phase(f"{names}: {self.config.method}", 1.0)
             if saved is not None:
@@ -91,7 +108,7 @@ class Baseline:
             while not algorithm.finished:
                 algorithm.train()
                 self._enter(learning, algorithm)
-                if not algorithm.finished and time.monotonic() - self.saved >= self.config.run.checkpoint_seconds:
+                if not algorithm.finished and self.checkpoints.due():
                     self._save(learning, algorithm, time.time() - began)
             self._save(learning, algorithm, time.time() - began)
             for member in range(first, learning[-1] + 1):
@@ -107,10 +124,12 @@ class Baseline:
         """
         report = algorithm.report
         self._count(report)
+        for runner in report.lost:
+            self.reporter.note(f"runner {runner} was lost: its environments are missing until Ray has restarted it")
         for member in learning:
             figures = report.figures[member]
             steps = sum(self.books.training_steps(member).values())
-            shown = {f"real_{k}" if k in NEVER_GIVEN else f"ppo/{k}": v for k, v in figures.items()}
+            shown = {f"real_{k}" if k in SCORES else f"ppo/{k}": v for k, v in figures.items()}
             self.books.log(member, steps, **shown, iteration=algorithm.rounds)
             for name, value in figures.items():
                 if not math.isfinite(value):
@@ -136,7 +155,7 @@ class Baseline:
 
     def _tell(self, learning: tuple[int, ...], algorithm: Algorithm) -> None:
         scores = [algorithm.scores(member) for member in learning]
-        told = {name.upper(): [score[name] for score in scores if name in score] for name in NEVER_GIVEN}
+        told = {name.upper(): [score[name] for score in scores if name in score] for name in SCORES}
         means = {name: round(sum(values) / len(values), 2) for name, values in told.items() if values}
         steps = sum(sum(self.books.training_steps(member).values()) for member in learning)
         self.reporter.update(min(1.0, algorithm.progress), steps=steps, **means)
@@ -149,7 +168,8 @@ class Baseline:
         scores = algorithm.scores(member)
         extra = {**scores, "iterations": algorithm.rounds, "seconds": round(seconds / len(learning), 1)}
         critics = {f"critics.{name}": array for name, array in algorithm.critics(member).items()}
-        save_state(self._member(member), {"ledger": len(self.books.ledger), "sequence": self.sequence})
+        known = {"ledger": len(self.books.ledger), "sequence": self.sequence}
+        save_state(member_folder(self.books.dir, member), known)
         self.books.add_member(policy, critics, seed=self.config.run.seed * 1000 + member, extra=extra)
         steps = sum(self.books.training_steps(member).values())
         told = ", ".join(f"{name.upper()} {value:.2f}" for name, value in scores.items())
@@ -172,41 +192,25 @@ class Baseline:
             "sequence": self.sequence,
             "seconds": seconds,
         }
-        save_state(self._progress, state)
-        self.saved = time.monotonic()
+        self.checkpoints.save(learning[0], state, dict)
         self.books.checkpointed(learning[-1], algorithm.rounds)
 
     def _resume(self) -> tuple[int, dict[str, Any] | None]:
-        """The next member to add, and the checkpoint of its training if there is one."""
-        present = len(self.books.population)
-        saved = load_state(self._progress) if self._written(self._progress) else None
-        if saved is not None and present + 1 not in saved["learning"]:
-            saved = None
-        if saved is not None:
-            self._forget(saved["ledger"])
-        elif present:
-            done = load_state(self._member(present))
-            self._forget(done["ledger"])
-            self.sequence = int(done["sequence"])
-        else:
-            self._forget(0)
-        return present + 1, saved
-
-    def _forget(self, entries: int) -> None:
-        """Work that no checkpoint holds will be done again: its steps leave the ledger."""
-        if lost := self.books.ledger.cut(entries):
+        """The next member to add, and the last checkpoint of its training if there is one; other work is done again."""
+        present, saved = len(self.books.population), None
+        if present < self.config.population.size:
+            saved = self.checkpoints.load(self._begin(present + 1))
+        if self.checkpoints.note:
+            self.reporter.note(self.checkpoints.note)
+        done = finished_member(self.books.dir, present) if present else {}
+        self.sequence = int(done.get("sequence", 0))
+        held, wanted = len(self.books.ledger), (saved or done).get("ledger", 0)
+        if wanted > held:
+            problem = f"has {held} entries, the checkpoint knows {wanted}"
+            raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
+        if lost := self.books.ledger.cut(wanted):
             self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
-
-    @property
-    def _progress(self) -> Path:
-        return self.folder / "progress"
-
-    def _member(self, member: int) -> Path:
-        return self.folder / f"member_{member:03d}"
-
-    @staticmethod
-    def _written(folder: Path) -> bool:
-        return folder.exists() or folder.with_name(folder.name + ".old").exists()
+        return present + 1, saved
 
 
 class Mappo(Baseline):
@@ -224,3 +228,75 @@ class CoMeDi(Baseline):
 
     cross = True
     mixed = True
+
+
+# ---- what a training needs -------------------------------------------------------------------------------------------
+
+
+def check_needs(job: Job, spec: EnvSpec, cluster: ClusterConfig, tell: Callable[[str], None]) -> None:
+    """Memory, the card and the room for runners that a training asks for; `tell` hears of waiting for nodes.
+
+    Raises:
+        UserError: one of them is missing.
+    """
+    check_memory(job, spec)
+    check_card(cluster)
+    wait_for_runners(job.ppo.runners, cluster, tell)
+
+
+def check_memory(job: Job, spec: EnvSpec) -> None:
+    """Observations must fit the memory: an iteration's, as they were sampled and as they are learned from, and those of
+    the fresh episodes.
+
+    Raises:
+        UserError: they do not.
+    """
+    view, ppo = spec.views[job.ppo.view], job.ppo
+    steps = {"ppo.steps": 2 * (ppo.steps + 1) * sum(group.envs for group in job.groups())}
+    if job.fresh and job.diversity is not None:
+        episodes = 2 * job.diversity.select_episodes * len(job.frozen)
+        steps["diversity.select_episodes"] = (spec.horizon + 1) * episodes
+    row, have = spec.num_players * math.prod(view.shape) * np.dtype(view.dtype).itemsize, memory_bytes()
+    for field, count in steps.items():
+        if count * row > have:
+            problem = f"observations of {count:,} steps take {count * row / 2**30:,.1f} GiB of memory"
+            fix = "lower it or the number of environments"
+            raise UserError(field, f"{problem}, this machine has {have / 2**30:.1f}", fix)
+
+
+def check_card(cluster: ClusterConfig) -> None:
+    """A learner that asks for a GPU finds one in this process.
+
+    Raises:
+        UserError: there is none.
+    """
+    if cluster.agent_gpus > 0.0 and not torch.cuda.is_available():
+        problem = f"{cluster.agent_gpus:g}, but the driver, in whose process the baselines learn, sees no GPU"
+        raise UserError("cluster.agent_gpus", problem, "set it to 0, or start the driver where there is one")
+
+
+def wait_for_runners(runners: int, cluster: ClusterConfig, tell: Callable[[str], None]) -> None:
+    """Until every remote runner finds room on a node: without it, it would wait for ever.
+
+    Raises:
+        UserError: a local Ray has no room, or a cluster has none within `cluster.wait_seconds`.
+    """
+    needed = {name: amount for name, amount in {"CPU": cluster.sampler_cpus, **cluster.resources}.items() if amount}
+    began, told = time.monotonic(), False
+    while (room := places(needed, [node["Resources"] for node in ray.nodes() if node["Alive"]], runners)) < runners:
+        each = " and ".join(f"{amount:g} {name}" for name, amount in needed.items())
+        problem = f"{runners} that take {each} each, Ray has room for {room}"
+        if cluster.address is None or time.monotonic() - began >= cluster.wait_seconds:
+            raise UserError("ppo.runners", problem, "lower it, or what each takes (cluster.sampler_cpus, resources)")
+        if not told:
+            tell(f"waiting for nodes: {problem}")
+        told = True
+        time.sleep(1.0)
+
+
+def places(needed: Mapping[str, float], nodes: Sequence[Mapping[str, float]], most: int) -> int:
+    """How many processes, `most` at most, that take `needed` each find room on nodes of these resources."""
+    if not needed:
+        return most
+    room = (min(math.floor(node.get(name, 0.0) / amount + 1e-9) for name, amount in needed.items()) for node in nodes)
+    return min(most, sum(room))

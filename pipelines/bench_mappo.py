@@ -8,9 +8,10 @@ from typing import Any
 import ray
 
 from actors.common import build_env, settle
+from pipelines.baselines import check_needs
 from pipelines.crew import start_ray
 from popgen.config import RunConfig
-from popgen.rllib.algorithm import MappoConfig
+from popgen.rllib.algorithm import Mappo, MappoConfig
 from popgen.rllib.job import Job
 
 
@@ -19,7 +20,7 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
 
     Args:
         config: a run of method=mappo.
-        seconds: time of the measurement, after one iteration that is not counted.
+        seconds: time of the measurement, after one iteration that is not counted; one is measured at least.
 
     Returns:
         env, threads, runners, envs, iterations, steps; seconds and cpu_seconds (of this process and its threads) that
@@ -27,13 +28,14 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
         minibatches), gradients (forward, backward, optimiser), rllib (all else that happens in an iteration).
 
     Raises:
-        UserError: no Ray answers.
+        UserError: no Ray answers, or it has not what the training needs.
     """
     settle(config.cluster.threads)
     spec = build_env(config.env, 1).spec
     job = Job(config.env, config.ppo, None, (1,), seed=config.run.seed)
     mine = start_ray(config.cluster)
     try:
+        check_needs(job, spec, config.cluster, lambda text: None)
         algorithm = MappoConfig.of(job, spec, config.cluster).build_algo()
         try:
             measured = _train(algorithm, seconds)
@@ -47,17 +49,18 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
     return about | measured
 
 
-def _train(algorithm: Any, seconds: float) -> dict[str, Any]:
+def _train(algorithm: Mappo, seconds: float) -> dict[str, Any]:
     algorithm.train()
     spent = {"sampling": 0.0, "pooling": 0.0, "gradients": 0.0}
-    steps = iterations = 0
+    steps, iterations, passed = 0, 0, 0.0
     began, cpu = time.perf_counter(), time.process_time()
-    while (passed := time.perf_counter() - began) < seconds:
+    while passed < seconds:
         algorithm.train()
         iterations += 1
         steps += sum(counted.steps for counted in algorithm.report.counted)
         for name in spent:
             spent[name] += algorithm.report.seconds[name]
+        passed = time.perf_counter() - began
     used = time.process_time() - cpu
     shares = {name: round(value / passed, 3) for name, value in spent.items()}
     shares["rllib"] = round(1.0 - sum(spent.values()) / passed, 3)

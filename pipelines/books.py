@@ -15,9 +15,10 @@ import numpy as np
 
 from actors.sampler import Collected
 from actors.tracker import RemoteTracker
-from pipelines.runs import RunState
+from pipelines.runs import RunState, named, run_folder
 from pipelines.watch import DiskWatch, RunLog, gauge, show_figures
 from popgen.config import RunConfig
+from popgen.data.checkpoint import read_regular
 from popgen.data.ledger import Ledger
 from popgen.data.storage import Mirror
 from popgen.envs.base import EnvSpec
@@ -67,9 +68,9 @@ class Books:
         params = config.relevant()
         self.tracker = tracker or RemoteTracker(config.tracking, self.dir, self.run_id, params, self._resumed())
         self.events = RunLog(self.dir, self.run_id, self.attempt)
+        self._next_member()
         self.disk = DiskWatch(self.dir, config.run.disk_reserve)
         self.mirror = Mirror(self.dir, config.run.storage) if config.run.storage else None
-        self.iterations: Counter[int] = Counter()
         self.state.start(self.attempt)
         self.events.write("start", method=config.method, environment=config.env.name)
 
@@ -77,7 +78,7 @@ class Books:
         path = self.dir / "config.json"
         if path.exists() or path.is_symlink():
             try:
-                known = RunConfig.parse(json.loads(path.read_text(), object_pairs_hook=unique))
+                known = RunConfig.parse(json.loads(read_regular(path), object_pairs_hook=unique))
             except (OSError, ValueError, RecursionError) as error:  # damaged, or of a version with other fields
                 raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
             if known.digest() != self.config.digest():
@@ -86,7 +87,7 @@ class Books:
 
     def _next_attempt(self) -> int:
         path = self.dir / "attempts.txt"
-        attempt = 1 + (len(path.read_text().splitlines()) if path.exists() else 0)
+        attempt = 1 + (read_regular(path).count(b"\n") if path.exists() else 0)
         with path.open("a") as file:
             file.write(datetime.now(UTC).isoformat() + "\n")
         return attempt
@@ -94,17 +95,18 @@ class Books:
     def _resumed(self) -> dict[str, Any] | None:
         path = self.dir / "tracking.json"
         try:
-            known = json.loads(path.read_text()) if path.exists() else {}
-            if not isinstance(known, dict) or not isinstance(known.get("runs", {}), dict):
+            known = json.loads(read_regular(path)) if path.exists() else {}
+            runs = known.get("runs", {}) if isinstance(known, dict) else None
+            if not isinstance(runs, dict) or not all(isinstance(run, str) for run in runs.values()):
                 raise ValueError("it holds no runs")
-        except (ValueError, RecursionError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise UserError(str(path), f"cannot be read ({error})", "remove it: MLflow gets new runs") from None
         return known if known or self.attempt > 1 else None
 
     def _mend_metrics(self) -> None:
         """A process that died while it wrote a point leaves half a line."""
         path = self.dir / "metrics.jsonl"
-        data = path.read_bytes() if path.exists() else b""
+        data = read_regular(path) if path.exists() else b""
         if data and not data.endswith(b"\n"):
             os.truncate(path, data.rfind(b"\n") + 1)
 
@@ -149,10 +151,9 @@ class Books:
     def checkpointed(self, member: int, iteration: int) -> None:
         """Tell that a checkpoint is whole on disk, after `iteration` iterations of `member`: it is copied to the
         storage. A storage that does not take it is told of and does not stop the run."""
-        self.iterations[member] = iteration
         gauge("popgen_iteration", iteration, run=self.run_id, member=str(member))
-        steps = self.ledger.steps(member=member)
-        self.events.write("checkpoint", member=member, iteration=iteration, steps=steps)
+        self.events.place = {"member": member, "iteration": iteration}
+        self.events.write("checkpoint", steps=self.ledger.steps(member=member))
         self._copy()
 
     def _copy(self) -> None:
@@ -187,7 +188,13 @@ class Books:
         self.save_tracking()
         gauge("popgen_members", member, run=self.run_id)
         self.events.write("member", member=member, steps=sum(self.training_steps(member).values()))
+        self._next_member()
         self._copy()
+
+    def _next_member(self) -> None:
+        """Lines of the log are from now on of the member that the population does not hold yet."""
+        member = len(self.population) + 1
+        self.events.place = {"member": member} if member <= self.config.population.size else {}
 
     def member_steps(self) -> list[int]:
         """Environment steps that each member's training took, those of another run included."""
@@ -221,33 +228,20 @@ class Books:
             if status == "FINISHED":
                 self._copy()
         finally:
-            self._end(status, error)
+            self._tell_end(status, error)
+            self.state.end(status, error)
 
     def give_over(self, error: BaseException) -> None:
         """An actor or a node died: this attempt ends, other books of this process go on with its tracker."""
         try:
             self.ledger.flush()
         finally:
-            self._end("KILLED", error)
+            self._tell_end("KILLED", error)
+            self.state.release()
 
-    def _end(self, status: str, error: BaseException | None) -> None:
+    def _tell_end(self, status: str, error: BaseException | None) -> None:
         text = None if error is None else " ".join(str(error).split())[:500]
         self.events.write("end", level="INFO" if error is None else "ERROR", status=status, error=text)
-        self.state.end(status, error)
-
-
-def named(config: RunConfig) -> RunConfig:
-    """The config with an id for its run: method, environment, seed and time, if it has none."""
-    if config.run.id:
-        return config
-    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
-    name = f"{config.method}-{Path(config.env.name).stem}-s{config.run.seed}-{stamp}"
-    return config.model_copy(update={"run": config.run.model_copy(update={"id": name})})
-
-
-def run_folder(config: RunConfig) -> Path:
-    """Where a `named` run keeps everything."""
-    return Path(config.run.root) / str(config.run.id)
 
 
 def _replace(path: Path, text: str) -> None:

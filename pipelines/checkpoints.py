@@ -21,6 +21,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from popgen.data.checkpoint import load_state, save_state
 from popgen.data.segments import load_segments, save_segments
 from popgen.errors import UserError
@@ -41,11 +43,40 @@ def fitting(folder: Path) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:  # torch's too
         cause = getattr(error, "cause", error)  # Ray's error of an actor is of both types
         reason = f"no {cause}" if isinstance(cause, KeyError) else str(cause).partition("\n")[0]
         problem = f"its checkpoint does not fit this run ({reason})"
         raise UserError(str(folder), problem, "remove it or start a new run") from None
+
+
+def same_form(value: Any, like: Any, name: str = "a part") -> None:
+    """Weights from a checkpoint against those that they are to replace: names, shapes and types.
+
+    Raises:
+        ValueError: they differ.
+    """
+    if isinstance(like, dict):
+        if not isinstance(value, dict) or value.keys() != like.keys():
+            raise ValueError(f"{name} has other tensors")
+        for key, item in like.items():
+            same_form(value[key], item, key)
+    elif not isinstance(value, np.ndarray) or (value.shape, value.dtype) != (like.shape, like.dtype):
+        raise ValueError(f"{name} is of another shape or type")
+
+
+def finished_member(root: Path, member: int) -> dict[str, Any]:
+    """The checkpoint of a finished member; its `ledger` is a length, or is not there.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    folder = member_folder(root, member)
+    state = load_state(folder)
+    length = state.get("ledger", 0)
+    if type(length) is not int or length < 0:
+        raise UserError(str(folder), "is no checkpoint of a finished member", "remove it or start a new run")
+    return state
 
 
 def _log_of(folder: Path, state: dict[str, Any]) -> dict[str, Any]:
@@ -53,7 +84,8 @@ def _log_of(folder: Path, state: dict[str, Any]) -> dict[str, Any]:
     log = state.get("log")
     found = log if isinstance(log, dict) else {}
     counts = (state.get("member"), state.get("ledger"), *(found.get(name) for name in ("first", "count", "rows")))
-    if any(type(count) is not int or count < 0 for count in counts) or not isinstance(found.get("base"), str | None):
+    whole = all(type(count) is int and 0 <= count < 2**63 for count in counts)
+    if not whole or found["first"] > found["count"] or not isinstance(found.get("base"), str | None):
         raise UserError(str(folder), "is no checkpoint of a running member", "remove it or start a new run")
     return found
 

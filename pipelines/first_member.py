@@ -288,9 +288,12 @@ class FirstMember:
         self.driver.save(MEMBER, self.rounds, {"first_member": state, "samplers": self.driver.crew.players.state()})
 
     def _restore(self, state: dict[str, Any]) -> None:
+        published, top = state["published"], state["top"]
+        self.driver.check_published(published, published | {"model": state["model"]}, (top or state)["published"])
         self.model, self.starts = ray.put(state["model"]), ray.put(Starts(**state["starts"]))
-        self.published, self.top = Published.of(state["published"]), Snapshot.of(state["top"])
-        self.recent.extend(state["recent"])
-        self.shaped.extend(state["shaped"])
-        self.figures = dict(state["figures"])
-        self.rounds, self.since_best, self.restarted, self.plays, self.confirmations = state["counters"]
+        self.published, self.top = Published.of(published), Snapshot.of(top)
+        self.recent.extend(map(float, state["recent"]))
+        self.shaped.extend(map(float, state["shaped"]))
+        self.figures = {str(name): float(value) for name, value in state["figures"].items()}
+        self.rounds, self.since_best, restarted, plays, self.confirmations = map(int, state["counters"])
+        self.restarted, self.plays = bool(restarted), bool(plays)

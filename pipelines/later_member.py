@@ -140,6 +140,7 @@ class LaterMember:
         )
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.best, self.number = Snapshot.of(state["best"]), state["number"]
+        self.driver.check_published(state["best"]["published"])
+        self.best, self.number = Snapshot.of(state["best"]), int(state["number"])
         self.plays = bool(state["plays"])
         self.returns.load_state(state["returns"])

@@ -12,13 +12,17 @@ from __future__ import annotations
 import errno
 import fcntl
 import json
+import math
 import os
 import socket
 import time
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
 
+from popgen.config import RunConfig
+from popgen.data.checkpoint import read_regular
 from popgen.errors import UserError
 
 LOCK, STATE = "run.lock", "state.json"
@@ -26,10 +30,28 @@ STATES = ("running", "finished", "failed", "interrupted", "damaged")
 OUTCOMES = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "interrupted"}
 """MLflow's status of a run -> ours."""
 
+_STATE_TYPES: dict[str, Any] = {
+    **{"state": str, "attempt": int, "pid": int, "host": str},
+    **{"began": int | float, "seconds": int | float, "error": str},
+}
 _TAKEN = (errno.EAGAIN, errno.EACCES)
-_TRIES, _PAUSE = 10, 0.05  # a look at the lock holds it for a moment
+_TRIES, _PAUSE = 40, 0.05  # a look at the lock holds it for a moment, and a killed process until it is gone
 _ACTIVE = ("metrics.jsonl", "ledger.jsonl", STATE)
 """Files that a living driver writes to: the last of these times is when an attempt was last heard of."""
+
+
+def named(config: RunConfig) -> RunConfig:
+    """The config with an id for its run: method, environment, seed and time, if it has none."""
+    if config.run.id:
+        return config
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+    name = f"{config.method}-{Path(config.env.name).stem}-s{config.run.seed}-{stamp}"
+    return config.model_copy(update={"run": config.run.model_copy(update={"id": name})})
+
+
+def run_folder(config: RunConfig) -> Path:
+    """Where a `named` run keeps everything."""
+    return Path(config.run.root) / str(config.run.id)
 
 
 class RunState:
@@ -44,7 +66,7 @@ class RunState:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.began, self._past, self._attempt = folder, time.time(), 0.0, 0
-        self._file = open(folder / LOCK, "a+", encoding="utf-8")  # noqa: SIM115 (held until the end)
+        self._file = open(folder / LOCK, "a+", encoding="utf-8", errors="replace")  # noqa: SIM115 (held until the end)
         if not _lock(self._file):
             self._file.seek(0)
             holder = self._file.read(200).strip() or "another process"
@@ -63,13 +85,13 @@ class RunState:
             UserError: another driver is.
         """
         if (folder / LOCK).exists():
-            RunState(folder)._file.close()
+            RunState(folder).release()
 
     def start(self, attempt: int) -> None:
         """The attempt begins."""
         try:
-            self._past = _seconds(self.folder, _read_state(self.folder))
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            self._past = _seconds(self.folder, read_state(self.folder))
+        except (OSError, ValueError, OverflowError, RecursionError):
             self._past = 0.0  # a damaged file costs the time of earlier attempts, and nothing else
         self.began, self._attempt = time.time(), attempt
         self._write("running")
@@ -78,6 +100,10 @@ class RunState:
         """It ended with an MLflow status; the lock is given up."""
         text = None if error is None else " ".join((str(error) or type(error).__name__).split())[:500]
         self._write(OUTCOMES[status], text)
+        self.release()
+
+    def release(self) -> None:
+        """Give up the lock, for the next attempt of this process: the state stays what it is."""
         self._file.close()
 
     def _write(self, state: str, error: str | None = None) -> None:
@@ -133,27 +159,33 @@ def describe_run(folder: Path) -> dict[str, Any]:
     attempts; attempt; began (of the last attempt, seconds since 1970); error (of the last attempt, None without one).
     A folder with a file that cannot be read is "damaged", and `error` names it.
     """
-    known: dict[str, Any] = {"id": folder.name, "state": "damaged", "method": None, "scale": None}
+    known: dict[str, Any] = {"id": _plain(folder.name), "state": "damaged", "method": None, "scale": None}
     known |= {"environment": None, "member": None, "size": None, "steps": {}, "total_steps": 0}
     known |= {"seconds": 0.0, "attempt": None, "began": None, "error": None}
     path = folder / "config.json"
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-        known |= {"method": config["method"], "scale": config["scale"], "environment": config["env"]["name"]}
-        known["size"] = int(config["population"]["size"])
+        config = json.loads(read_regular(path))
+        named = {"method": config["method"], "scale": config["scale"], "environment": config["env"]["name"]}
+        known |= {key: _plain(value) for key, value in named.items()} | {"size": int(config["population"]["size"])}
         path = folder / STATE
-        state = _read_state(folder)
+        state = read_state(folder)
         known |= {"seconds": _seconds(folder, state), "attempt": state.get("attempt"), "began": state.get("began")}
         path = folder / "population" / "manifest.json"
-        members = len(json.loads(path.read_text(encoding="utf-8"))["members"]) if path.exists() else 0
+        members = len(json.loads(read_regular(path))["members"]) if path.exists() else 0
         known["member"] = min(members + 1, known["size"])
         path = folder / "ledger.jsonl"
         known["steps"] = _steps(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         return known | {"error": f"{path.relative_to(folder)} cannot be read ({_reason(error)})"}
     done = members >= known["size"] and (folder / "report" / "crossplay.json").exists()
-    known |= {"state": _present(folder, state, done), "error": state.get("error")}
+    told = state.get("error")
+    known |= {"state": _present(folder, state, done), "error": None if told is None else _plain(told)}
     return known | {"total_steps": sum(known["steps"].values())}
+
+
+def _plain(value: Any) -> str:
+    """Text in one line that a terminal takes for text: what other programs wrote may hold control characters."""
+    return "".join(letter if letter.isprintable() else "?" for letter in str(value))
 
 
 def _present(folder: Path, state: dict[str, Any], done: bool) -> str:
@@ -180,13 +212,23 @@ def _is_alive(lock: Path, state: dict[str, Any]) -> bool:
     return state.get("host") != socket.gethostname() or Path(f"/proc/{state.get('pid')}").exists()
 
 
-def _read_state(folder: Path) -> dict[str, Any]:
+def read_state(folder: Path) -> dict[str, Any]:
+    """`state.json`, {} without one.
+
+    Raises:
+        OSError, ValueError, RecursionError: it cannot be read, or a field is not of its type.
+    """
     path = folder / STATE
     if not path.exists():
         return {}
-    state = json.loads(path.read_text(encoding="utf-8"))
+    state = json.loads(read_regular(path))
     if not isinstance(state, dict):
         raise ValueError("no object")
+    for name, kinds in _STATE_TYPES.items():
+        value = state.get(name)
+        wrong = isinstance(value, bool) or not isinstance(value, kinds)
+        if value is not None and (wrong or isinstance(value, float) and not math.isfinite(value)):
+            raise ValueError(f"{name} is {value!r:.40}")
     return state
 
 
@@ -196,16 +238,16 @@ def _seconds(folder: Path, state: dict[str, Any]) -> float:
     if state.get("state") != "running":
         return known
     heard = max((folder / name).stat().st_mtime for name in _ACTIVE if (folder / name).exists())
-    return round(known + max(0.0, heard - float(state["began"])), 1)
+    return round(known + max(0.0, heard - float(state.get("began") or heard)), 1)
 
 
 def _steps(ledger: Path) -> dict[str, int]:
     """Environment steps by kind; a line that is still being written does not count."""
     steps: Counter[str] = Counter()
-    whole = ledger.read_bytes().rpartition(b"\n")[0] if ledger.exists() else b""
+    whole = read_regular(ledger).rpartition(b"\n")[0] if ledger.exists() else b""
     for line in whole.splitlines():
         entry = json.loads(line)
-        steps[str(entry["kind"])] += int(entry["steps"])
+        steps[_plain(entry["kind"])] += int(entry["steps"])
     return dict(steps)
 
 
@@ -213,4 +255,4 @@ def _reason(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"it has no {error.args[0]!r}"
     text = getattr(error, "strerror", None) or str(error)
-    return " ".join(text.split())[:120] or type(error).__name__
+    return _plain(" ".join(text.split())[:120]) or type(error).__name__

@@ -52,4 +52,6 @@ class Snapshot:
     @staticmethod
     def of(state: dict[str, Any] | None) -> Snapshot | None:
         """From `state()`; None stays None."""
-        return None if state is None else Snapshot(Published.of(state["published"]), state["sp"], state["xp"])
+        if state is None:
+            return None
+        return Snapshot(Published.of(state["published"]), float(state["sp"]), float(state["xp"]))

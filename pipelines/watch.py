@@ -67,19 +67,23 @@ def show_figures(run: str, member: int, figures: Mapping[str, float]) -> None:
 
 
 class RunLog:
-    """`run.log` in the run's folder: one JSON object a line, each with time, level, run, attempt and event.
+    """`run.log` in the run's folder: one JSON object a line, each with time, level, run, attempt, event and place.
 
-    Where they apply: member, iteration, text, and other fields of the event. Events: start, note, checkpoint, member,
-    lost (an actor or node died), end. A line that cannot be written is dropped: the log never stops a run.
+    Where they apply: text, and other fields of the event. Events: start, note, checkpoint, member, lost (an actor or
+    node died), end. A line that cannot be written is dropped: the log never stops a run.
+
+    Attributes:
+        place: where the run is: the member in training, {} after the last, and its iteration once that is known.
     """
 
     def __init__(self, folder: Path, run: str, attempt: int) -> None:
         self.path, self._common = folder / LOG, {"run": run, "attempt": attempt}
+        self.place: dict[str, int] = {}
 
     def write(self, event: str, *, level: str = "INFO", **fields: Any) -> None:
         """Append one line."""
         stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
-        row = {"time": stamp, "level": level, **self._common, "event": event, **fields}
+        row = {"time": stamp, "level": level, **self._common, "event": event, **self.place, **fields}
         try:
             with self.path.open("a") as file:
                 file.write(json.dumps(row) + "\n")

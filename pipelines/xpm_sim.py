@@ -14,12 +14,12 @@ from actors.common import options
 from actors.exact_learner import ExactLearnerActor, Learned
 from actors.sampler import PolicyParts, SamplerActor
 from pipelines.books import Books
-from pipelines.checkpoints import Checkpoints, fitting, member_folder
+from pipelines.checkpoints import Checkpoints, finished_member, fitting, member_folder, same_form
 from pipelines.play import Players
 from popgen.algos.xpm_sim.learner import make_actor
 from popgen.algos.xpm_wm.partners import PartnerReturns
 from popgen.config import RunConfig
-from popgen.data.checkpoint import load_state, save_state
+from popgen.data.checkpoint import save_state
 from popgen.data.sampler import Episode, Team
 from popgen.envs.base import EnvSpec
 from popgen.envs.reward import rewards_events
@@ -114,9 +114,9 @@ class XpmSim:
         """Finished members of this run, and the running one's last checkpoint; work behind neither is done again."""
         known = len(self.books.population)
         saved = self.checkpoints.load(known + 1)
-        last = load_state(member_folder(self.books.dir, known)) if known else {"ledger": 0, "encoder": None}
-        self.encoder = last["encoder"]
-        held, wanted = len(self.books.ledger), (saved or last)["ledger"]
+        last = finished_member(self.books.dir, known) if known else {}
+        self.encoder = last.get("encoder")
+        held, wanted = len(self.books.ledger), (saved or last).get("ledger", 0)
         if wanted > held:
             problem = f"has {held} entries, the checkpoint knows {wanted}"
             raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
@@ -262,8 +262,10 @@ class Member:
         driver.books.checkpointed(self.member, self.round)
 
     def _restore(self, progress: dict[str, Any]) -> None:
-        self.round, self.updates, self.steps = progress["counters"]
-        self.figures, self.acting = dict(progress["figures"]), progress["acting"]
+        self.round, self.updates, self.steps = map(int, progress["counters"])
+        self.figures = {str(name): float(value) for name, value in progress["figures"].items()}
+        same_form(progress["acting"], self.acting, "the policy")
+        self.acting = progress["acting"]
         self.returns.load_state(progress["returns"])
         # Fresh samplers have played nothing; only the running number of their segments matters.
         self.driver.crew.players.load_state(progress["samplers"])

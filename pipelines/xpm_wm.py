@@ -11,13 +11,13 @@ import ray
 
 from actors.sampler import Collected, PolicyParts
 from pipelines.books import Books
-from pipelines.checkpoints import Checkpoints, fitting, member_folder
+from pipelines.checkpoints import Checkpoints, finished_member, fitting, member_folder, same_form
 from pipelines.crew import Crew
 from pipelines.first_member import FirstMember
 from pipelines.later_member import LaterMember
 from pipelines.snapshot import Snapshot
 from popgen.config import RunConfig
-from popgen.data.checkpoint import load_state, save_state
+from popgen.data.checkpoint import save_state
 from popgen.data.sampler import Episode
 from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
@@ -54,7 +54,7 @@ class XpmWm:
         try:
             known, base, saved = self._resume()
             for member in range(known + 1, self.config.population.size + 1):
-                began, self.steps = time.time(), saved["steps"] if saved else 0
+                began, self.steps = time.time(), 0
                 seed = self.config.run.seed * 1000 + member
                 if saved is None:
                     self.checkpoints.begin(base)
@@ -146,6 +146,7 @@ class XpmWm:
         """
         with fitting(self.checkpoints.folder):
             self._restore(saved)
+            self.steps = int(saved["steps"])
         self.reporter.note(f"going on after {self.steps:,} steps of member {saved['member']}")
 
     def _restore(self, saved: dict[str, Any]) -> None:
@@ -162,6 +163,17 @@ class XpmWm:
             ray.get(list(added))
         ray.get([getattr(crew, name).load_marks.remote(saved["marks"][name]) for name in REPLAYS])
         ray.get([getattr(crew, name).load_state.remote(saved[name]) for name in LEARNERS])
+
+    def check_published(self, *published: dict[str, Weights]) -> None:
+        """Weights that a checkpoint brings back beside the learners' states must be of the restored learners' form.
+
+        Raises:
+            ValueError: they are not.
+        """
+        model, agent = ray.get([self.crew.model.weights.remote(), self.crew.agent.state.remote()])
+        acting = ray.get(self.crew.agent.acting_weights.remote(model))
+        for weights in published:
+            same_form(weights, {"acting": acting, "model": model, "critics": agent["critics"]}, "the published policy")
 
     def _replays(self) -> dict[str, Any]:
         states = ray.get([getattr(self.crew, name).state.remote() for name in REPLAYS])
@@ -185,10 +197,11 @@ class XpmWm:
             self._forget(saved["ledger"] if saved else 0)
             return 0, None, saved
         folder = member_folder(root, known)
-        state = load_state(folder)
+        state = finished_member(root, known)
         self._forget(saved["ledger"] if saved else state.get("ledger") if root == self.books.dir else 0)
         if saved is None:
-            ray.get([getattr(self.crew, name).load_state.remote(state[name]) for name in (*REPLAYS, "model")])
+            with fitting(folder):
+                ray.get([getattr(self.crew, name).load_state.remote(state[name]) for name in (*REPLAYS, "model")])
         self._take_over(root, known, present)
         return known, folder, saved
 

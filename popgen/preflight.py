@@ -7,21 +7,27 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from popgen.config import OPEN_LOOP, SHAPES, ClusterConfig, RunConfig
+from popgen.data import sizes
 from popgen.envs.base import EnvSpec
 from popgen.envs.registry import make_env
 from popgen.errors import UserError
 from popgen.tracking import check_uri
 
-MARGIN = 256 * 2**20
-"""Bytes of disk beside buffers and weights: MLflow's file, logs, plots."""
+RAYS_SHARE = 0.3
+"""Of the memory, for the object store where no size is given."""
+
+CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+"""Where a container's limit is told (cgroups 2 and 1)."""
 
 MOST_EPISODES = 1_000_000
 """Of an evaluation."""
+
+_CAPACITY = {"xpm_wm": "replay.capacity", "xpm_sim": "xpm_sim.capacity"}
+_BATCH = {"xpm_wm": "agent.horizon", "xpm_sim": "xpm_sim.unroll"}
 
 _RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -32,7 +38,7 @@ def preflight(config: RunConfig) -> None:
     Raises:
         UserError: an environment that cannot be built or pays nothing for events, a view it does not have, windows or
             buffers of a size that does not fit it, a population to start from that is not of this environment, an
-            unsafe run id, a root that cannot be written or would not stay, or too little disk or memory.
+            unsafe run id, a root or storage that cannot be written to or would not stay, or too little disk or memory.
     """
     spec = _build(config)
     check_run_id(config.run.id)
@@ -41,8 +47,6 @@ def preflight(config: RunConfig) -> None:
         _check_rewards(config, spec)
         _check_lengths(config, spec)
         check_cluster(config.cluster)
-        check_memory(config, spec)
-        check_store(config, spec)
     if "ppo" in config.relevant():
         check_baseline(config, spec)
     if config.method == "xpm_sim":
@@ -51,10 +55,14 @@ def preflight(config: RunConfig) -> None:
         check_uri(config.tracking.uri)
     if config.population.init_from is not None:
         _check_start(config, spec)
+    check_memory(config, spec)
+    if config.method in _CAPACITY:
+        check_store(config, spec)
     check_evaluation(config)
-    check_storage(config.run.storage)
     check_kept(Path(config.run.root))
-    check_root(Path(config.run.root), disk_bytes(config, spec))
+    check_root(Path(config.run.root), sizes.disk_bytes(config, spec))
+    if config.run.storage is not None:
+        check_storage(config, spec)
 
 
 def check_baseline(config: RunConfig, spec: EnvSpec) -> None:
@@ -86,10 +94,20 @@ def check_kept(root: Path) -> None:
         raise UserError("run.root", problem, "give an absolute path on storage that stays, shared by all nodes")
 
 
-def check_storage(uri: str | None) -> None:
-    """A URI; whether it can be reached is seen when the run opens it."""
-    if uri is not None and not re.match(r"[A-Za-z][A-Za-z0-9+.-]*://.", uri):
+def check_storage(config: RunConfig, spec: EnvSpec) -> None:
+    """A storage that can be opened and, where it is a folder of this machine, written to, with room for the copy."""
+    from popgen.data.storage import local_folder, open_storage
+
+    uri = str(config.run.storage)
+    if not re.match(r"[A-Za-z][A-Za-z0-9+.-]*://.", uri):
         raise UserError("run.storage", f"{uri!r} is no URI", "give one such as s3://bucket/path or file:///path")
+    folder = local_folder(*open_storage(uri))
+    if folder is None:
+        return
+    needed, root = sizes.copy_bytes(config, spec), Path(config.run.root)
+    if _device(folder) == _device(root):
+        needed += sizes.disk_bytes(config, spec)
+    check_root(folder, needed, "run.storage")
 
 
 def check_run_id(name: str | None) -> None:
@@ -101,49 +119,35 @@ def check_run_id(name: str | None) -> None:
         )
 
 
-def buffer_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Bytes of the two full replay buffers: a state, actions, events and 15 bytes of marks for each step."""
-    state = spec.state_size * np.dtype(spec.state_dtype).itemsize
-    return 2 * config.replay.capacity * (state + spec.num_players * (1 + spec.num_events) + 15)
-
-
-def disk_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Bytes of the run's folder at most: both buffers for each member, in two copies and a log for the running one."""
-    if config.method != "xpm_wm":
-        return MARGIN
-    return (config.population.size + 4) * buffer_bytes(config, spec) + MARGIN
-
-
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Both buffers and the object store must fit into this machine's memory; a cluster's nodes are not looked at."""
+    """Buffers, object store and a batch must fit into this machine's memory; a cluster's nodes are not looked at."""
     if config.cluster.address is not None:
         return
-    store = config.cluster.object_store_bytes or 0
-    needed, have = buffer_bytes(config, spec) + store, memory_bytes()
-    if needed > have:
-        told = f" and an object store of {_gib(store)}" if store else ""
-        problem = f"{config.replay.capacity:,} steps{told} need about {_gib(needed)}, this machine has {_gib(have)}"
-        raise UserError("replay.capacity", problem, "lower it")
-
-
-def store_bytes(config: RunConfig, spec: EnvSpec) -> int:
-    """Bytes that are in a node's object store at most.
-
-    Both whole buffers on their way to a checkpoint; of each sampler, two calls' segments (states twice, rewards and
-    marks); and a margin for weights and start states.
-    """
-    state = spec.state_size * np.dtype(spec.state_dtype).itemsize
-    row = 2 * state + spec.num_players * (1 + spec.num_events) + 10
-    steps = config.phase1.envs * max(400, config.phase1.steps_per_iteration)
-    return buffer_bytes(config, spec) + 2 * steps * row + MARGIN
+    needed, have = sizes.memory_needed(config, spec), memory_bytes()
+    if needed <= have:
+        return
+    batch, store = sizes.batch_bytes(config, spec), config.cluster.object_store_bytes or 0
+    parts = {
+        _CAPACITY.get(config.method, ""): 4 * sizes.buffer_bytes(config, spec),
+        _BATCH.get(config.method, "ppo.envs"): batch,
+        "cluster.object_store_bytes": store,
+    }
+    field = max(parts, key=lambda name: parts[name])
+    told = f"buffers of {_gib(sizes.buffer_bytes(config, spec))} and batches of {_gib(batch)}"
+    problem = f"{told}, with their copies and the object store, need about {_gib(needed)}, this machine has"
+    raise UserError(field, f"{problem} {_gib(have)}", "lower it")
 
 
 def check_store(config: RunConfig, spec: EnvSpec) -> None:
-    """An object store of a given size must hold what is in it at a time."""
-    given, needed = config.cluster.object_store_bytes, store_bytes(config, spec)
+    """The object store, given or Ray's own choice here, must hold what is in it at a time."""
+    given, needed = config.cluster.object_store_bytes, sizes.store_bytes(config, spec)
     if given is not None and given < needed:
         problem = f"{given:,} bytes, but {needed:,} may be in it at a time"
-        raise UserError("cluster.object_store_bytes", problem, "raise it or lower replay.capacity")
+        raise UserError("cluster.object_store_bytes", problem, f"raise it or lower {_CAPACITY[config.method]}")
+    chosen = int(RAYS_SHARE * memory_bytes())
+    if given is None and config.cluster.address is None and chosen < needed:
+        problem = f"Ray's own choice is {_gib(chosen)}, but {_gib(needed)} may be in it at a time"
+        raise UserError("cluster.object_store_bytes", problem, f"set it, or lower {_CAPACITY[config.method]}")
 
 
 def check_cluster(cluster: ClusterConfig) -> None:
@@ -166,7 +170,7 @@ def check_root(root: Path, needed: int, field: str = "run.root") -> None:
     """A folder to write to must be writable, or be made in one that is, with room for `needed` bytes."""
     fix = "choose another folder"
     try:
-        there = next(folder for folder in (root, *root.absolute().parents) if folder.exists())
+        there = _nearest(root)
         with tempfile.NamedTemporaryFile(dir=there, prefix=".popgen-"):
             pass
         free = shutil.disk_usage(there).free
@@ -177,9 +181,25 @@ def check_root(root: Path, needed: int, field: str = "run.root") -> None:
         raise UserError(field, problem, "free some space or choose another folder")
 
 
-def memory_bytes() -> int:
-    """Physical memory of this machine."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+def memory_bytes(limits: Sequence[str] = CGROUPS) -> int:
+    """Memory of this machine, or of the container that this process is in, if that is less."""
+    have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for path in limits:
+        try:
+            have = min(have, int(Path(path).read_text()))
+        except (OSError, ValueError):  # no such limit: the file is not there, or says "max"
+            continue
+    return have
+
+
+def _device(path: Path) -> int:
+    """The file system that a path is on, or will be."""
+    return _nearest(path).stat().st_dev
+
+
+def _nearest(path: Path) -> Path:
+    """The path, or the folder above it that is there."""
+    return next(folder for folder in (path, *path.absolute().parents) if folder.exists())
 
 
 def _build(config: RunConfig) -> EnvSpec:

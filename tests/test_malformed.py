@@ -270,6 +270,23 @@ CASES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "checkpoint without a learner": (in_state(lambda s: s.pop("agent")), "checkpoint"),
     "checkpoint of other sizes": (in_state(lambda s: shorten(s["model"])), "checkpoint"),
     "checkpoint whose ledger is text": (in_state(lambda s: s.update(ledger="all")), "checkpoint"),
+    "checkpoint without its steps": (in_state(lambda s: s.pop("steps")), "checkpoint"),
+    "checkpoint with moments of other sizes": (
+        in_state(lambda s: shorten(s["agent"]["actor_optimiser"])), "checkpoint"
+    ),
+    "checkpoint without a moment": (
+        in_state(lambda s: s["model"]["learner"]["optimiser"].pop("0.exp_avg")), "checkpoint"
+    ),
+    "checkpoint with a policy of other sizes": (
+        in_state(lambda s: shorten(s["first_member"]["published"]["acting"])), "checkpoint"
+    ),
+    "checkpoint whose counters are text": (
+        in_state(lambda s: s["first_member"].update(counters="many")), "checkpoint"
+    ),
+    "checkpoint with half a generator": (
+        in_state(lambda s: s["agent"].update(generator=s["agent"]["generator"][:99])), "checkpoint"
+    ),
+    "checkpoint that begins after its end": (in_state(lambda s: s["log"].update(first=10**6)), "checkpoint"),
     "segments cut": (cut(SEGMENTS, 0.5), "segments_000001"),
     "segments flipped": (flip(SEGMENTS, 0.8), "segments_000001"),
     "segments missing": (remove(SEGMENTS), "segments_000001"),

@@ -249,6 +249,44 @@ def test_a_users_error_fails_the_job_with_its_one_line(cluster: Cluster) -> None
     assert not (cluster.runs / "refused").exists()
 
 
+def test_the_entry_script_submits_a_job(cluster: Cluster) -> None:
+    """One that is refused at once; popgen is the nodes' own here."""
+    words = [ENTRY, "run", "run.id=refused", f"run.root={cluster.runs}", "population.size=0"]
+    done = subprocess.run(
+        words, env=cluster.environment, cwd=cluster.folder, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 1 and "popgen: error: population.size: " in done.stdout + done.stderr
+    assert not (cluster.runs / "refused").exists()
+
+
+def test_a_worker_joins_the_cluster(cluster: Cluster) -> None:
+    """A second node on this machine, with ports of its own; it is healthy, and leaves when it is told to."""
+
+    def alive() -> int:
+        headers = {"Authorization": f"Bearer {cluster.environment['RAY_AUTH_TOKEN']}"}
+        asked = urllib.request.Request(f"{cluster.dashboard}/nodes?view=summary", headers=headers)
+        with urllib.request.urlopen(asked, timeout=30) as answer:
+            nodes = json.load(answer)["data"]["summary"]
+        return sum(node["raylet"]["state"] == "ALIVE" for node in nodes)
+
+    agent, grpc, metrics = free_ports(3)
+    own = {"RAY_HEAD": f"127.0.0.1:{cluster.environment['RAY_PORT']}", "AGENT_PORT": str(agent)}
+    environment = cluster.environment | own
+    options = (f"--dashboard-agent-grpc-port={grpc}", f"--metrics-export-port={metrics}", "--num-cpus=1")
+    with open(cluster.folder / "worker.log", "wb") as log:
+        command = [ENTRY, "worker", *options, "--object-store-memory=100000000"]
+        worker = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=cluster.folder)
+    try:
+        until("the second node", lambda: alive() == 2, worker)
+        health = [ENTRY, "health", "worker"]
+        until("its health", lambda: subprocess.run(health, env=environment).returncode == 0, worker)
+        worker.terminate()
+        until("its end", lambda: alive() == 1)
+        assert subprocess.run(health, env=environment).returncode == 1
+    finally:
+        end(worker)
+
+
 def test_a_job_without_the_token_is_not_taken(cluster: Cluster) -> None:
     code, out = cluster.run("run.id=stranger", RAY_AUTH_TOKEN=secrets.token_hex(32))
     assert code != 0 and "token" in out and not (cluster.runs / "stranger").exists()

@@ -135,6 +135,25 @@ def test_an_artefact_that_is_not_taken_stops_nothing(tmp_path: Path, caplog: pyt
     tracker.finish()
 
 
+def test_the_machines_load_is_kept_with_the_run(tmp_path: Path) -> None:
+    """One sample, taken here and not after ten seconds; an attempt that goes on goes on with it."""
+    config, state = TrackingConfig(system_metrics=True), None
+    for attempt in (0, 1):
+        tracker = Tracker(config, tmp_path, "r", resume=state)
+        monitor = tracker._monitor
+        assert monitor.sampling_interval == 10 and monitor._process.is_alive()
+        monitor.collect_metrics()
+        monitor.publish_metrics(monitor.aggregate_metrics())
+        tracker.finish()
+        assert monitor._process is None  # joined
+        state = tracker.state()
+        assert [step for step, _ in history(tracker, "parent", "system/cpu_utilization_percentage")] == [
+            *range(attempt + 1)
+        ]
+    found = client(tracker).get_run(state["runs"]["parent"]).data.metrics
+    assert {"system/system_memory_usage_megabytes", "system/disk_usage_percentage"} <= found.keys()
+
+
 def test_off_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mlflow", None)  # an import would fail
     tracker = Tracker(TrackingConfig(enabled=False), tmp_path / "run", "r", {"a": 1})

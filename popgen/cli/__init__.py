@@ -2,6 +2,7 @@
 
     parser       the whole command line; each module of commands adds its own part
     run, population, comparison, experiments, bench    the commands, by subject
+    guard        a process of its own for `run`
     training     what the commands that train share
     compose      configuration files and overrides: the only file that knows Hydra
     arguments    the parser's class and the types of arguments
@@ -32,9 +33,11 @@ _DISK = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, 2 for an error told in one line, 130 when interrupted."""
+    """Run a command, that of this process without `argv`; returns the exit code: 0, 2 for an error told in one line,
+    130 when interrupted."""
     try:
         args = parse(sys.argv[1:] if argv is None else list(argv))
+        args.own_process = argv is None
         return args.command(args)
     except SystemExit as stop:  # --help and --version
         return int(stop.code or 0)

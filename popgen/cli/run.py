@@ -35,11 +35,17 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train a population and evaluate it, or say what would be done."""
+    from pipelines.runs import named, run_folder
+    from popgen.cli.guard import guarded
     from popgen.config import RunConfig
     from popgen.preflight import preflight
     from popgen.progress import make_reporter
 
     config = RunConfig.parse(compose(args.overrides))
+    if args.own_process and not args.dry_run:
+        config = named(config)
+        if (code := guarded(run_folder(config), config.cluster.retries)) is not None:
+            return code
     preflight(config)
     if args.dry_run:
         return _print_config(config.relevant(), args.json)

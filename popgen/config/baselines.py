@@ -70,14 +70,14 @@ class DiversityConfig(Schema):
     order: `concurrent` trains all members together, each the others' partner; `sequential` one after the other against
         frozen predecessors. CoMeDi is sequential.
     lambda_xp, lambda_mp: weights of cross-play and mixed play beside self-play's 1; lambda_xp rises in a straight line
-        over the first `warmup` iterations.
+        over the first `warmup` iterations. With lambda_mp=0 no mixed play is sampled.
     xp_envs, mp_envs: environments with each partner, half of them in each seating.
     xp_loss: `signed` negates the advantage before the clipped surrogate, `negated` the surrogate after it, as two
         published code bases do.
     partner_random: share of iterations in which a random partner takes the strongest one's place, so that the critics
         of the others are not forgotten.
     window: episodes with a partner (both seatings) behind its return. CoMeDi instead plays `select_episodes` fresh
-        episodes with each partner in each seating, every `select_every` iterations.
+        episodes with each partner in each seating, every `select_every` iterations, and goes by all of these.
     target_xp: see `ppo.target_score`.
     """
 

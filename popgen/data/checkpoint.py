@@ -5,6 +5,7 @@ values.json holds the digests of both parts, so that a damaged bit is noticed an
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -20,7 +21,6 @@ from popgen.errors import UserError
 
 ARRAYS, VALUES = "arrays.safetensors", "values.json"
 FORMAT = 2
-"""Format 1 had no digests: its values.json is the state itself."""
 
 
 def save_state(folder: str | Path, state: dict[str, Any]) -> None:
@@ -65,8 +65,8 @@ def load_state(folder: str | Path) -> dict[str, Any]:
     folder = Path(folder)
     whole = folder if folder.exists() else _old(folder)
     try:
-        data = (whole / ARRAYS).read_bytes()
-        state = _merge(_checked(json.loads((whole / VALUES).read_text()), data), load(data))
+        data = read_regular(whole / ARRAYS)
+        state = _merge(_checked(json.loads(read_regular(whole / VALUES)), data), load(data))
         if not isinstance(state, dict):
             raise ValueError(f"{VALUES} holds no dictionary")
         return state
@@ -74,12 +74,22 @@ def load_state(folder: str | Path) -> dict[str, Any]:
         raise UserError(str(folder), f"unreadable checkpoint ({error})", "remove it or start a new run") from None
 
 
+def read_regular(path: Path) -> bytes:
+    """Contents of a file; a device or a pipe in its place may have no end.
+
+    Raises:
+        OSError: it cannot be read, or is no regular file.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "is no regular file", str(path))
+    return path.read_bytes()
+
+
 def _checked(document: Any, data: bytes) -> Any:
     """The values of a document whose digests are right."""
-    if not isinstance(document, dict) or "format" not in document or "sha256" not in document:
-        return document  # format 1
-    if document["format"] != FORMAT:
-        raise ValueError(f"of format {document['format']!r}, this version reads {FORMAT}")
+    known = document.get("format") if isinstance(document, dict) else None
+    if known != FORMAT:
+        raise ValueError(f"of format {known!r}, this version reads {FORMAT}")
     values = document["values"]
     for name, content in (("arrays", data), ("values", _text(values))):
         if document["sha256"][name] != _sha256(content):

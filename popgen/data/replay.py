@@ -249,6 +249,6 @@ class Replay:
         self.size = len(arrays["stream"])
         for name in self.COLUMNS:
             getattr(self, name)[: self.size] = arrays[name]
-        self.head, self.streams, self.added = counters["head"], counters["streams"], counters["added"]
+        self.head, self.streams, self.added = (int(counters[name]) for name in ("head", "streams", "added"))
         self.rng.bit_generator.state = counters["rng"]
         self._cache.clear()

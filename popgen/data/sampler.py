@@ -110,7 +110,9 @@ class Sampler:
         self.env.set_state(state["env"])
         self.env.load_generator_state(state["generator"])
         self.seating.load_state(state["seating"])
-        self._whole, self._score, self._counts = (np.array(state[name]) for name in ("whole", "score", "counts"))
+        for name in ("whole", "score", "counts"):
+            own = getattr(self, f"_{name}")
+            setattr(self, f"_{name}", np.array(state[name], own.dtype).reshape(own.shape))
 
     def collect(self, steps: int) -> tuple[list[Segment], list[Episode]]:
         """Play `steps` joint steps: one segment per team, and the episodes that ended."""

@@ -20,6 +20,7 @@ from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from popgen.data.checkpoint import read_regular
 from popgen.errors import UserError
 
 LATEST, OBJECTS, MARK = "latest.json", "objects", "storage.json"
@@ -48,6 +49,13 @@ def open_storage(uri: str) -> tuple[Any, str]:
         except (ImportError, ValueError, OSError) as second:
             problem = f"cannot open {uri} ({first}; {second})"
             raise UserError("run.storage", problem, "give a URI such as s3://bucket/path or file:///path") from None
+
+
+def local_folder(system: Any, path: str) -> Path | None:
+    """The folder of this machine that `open_storage` gave, None if it is elsewhere."""
+    handler = getattr(system, "handler", None)
+    protocol = getattr(getattr(handler, "fs", None), "protocol", ())
+    return Path(path) if system.type_name == "local" or "file" in protocol else None
 
 
 class Mirror:
@@ -170,8 +178,8 @@ class Mirror:
 
     def _wrote(self) -> str | None:
         try:
-            return str(json.loads((self.folder / MARK).read_text())["writer"])
-        except (OSError, ValueError, KeyError, TypeError):
+            return str(json.loads(read_regular(self.folder / MARK))["writer"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
 
     def _latest(self) -> dict[str, Any] | None:
@@ -188,7 +196,7 @@ class Mirror:
             for name, (digest, _) in document["files"].items():
                 _check_names(name, digest)
             return {"writer": str(document["writer"]), "files": document["files"]}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(
                 "run.storage", f"{self.uri}/{LATEST} is unreadable ({error})", "choose another id"
             ) from None

@@ -19,9 +19,9 @@ SIGN: dict[Kind, float] = {Kind.SP: +1.0, Kind.MP: +1.0, Kind.XP: -1.0}
 def signed_advantage(kind: Kind, advantage: Tensor, *, weight: float, scale: Tensor | float) -> Tensor:
     """Advantage as it enters the policy gradient: sign x weight x advantage / scale.
 
-    `scale` is the spread of the *self-play* returns for every kind: cross-play's own, smaller spread would
-    multiply lambda several-fold. Cross-play advantages are centred, since pushing all returns down would
-    otherwise reward leaving the states in which they were collected.
+    `scale` comes from *self-play* for every kind (the on-policy baselines take the kind's own spread where that is
+    larger): cross-play's own, smaller spread would multiply lambda several-fold. Cross-play advantages are centred,
+    since pushing all returns down would otherwise reward leaving the states in which they were collected.
     """
     if kind is Kind.XP:
         advantage = advantage - advantage.mean()

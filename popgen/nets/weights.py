@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 Weights = dict[str, np.ndarray]
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's, in its own words
 
 
 def weights_of(module: nn.Module) -> Weights:
@@ -57,9 +58,19 @@ def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, np.ndarray]:
 
 
 def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, np.ndarray]) -> None:
-    """Take over `optimiser_state` of an optimiser over the same parameters."""
+    """Take over `optimiser_state` of an optimiser over the same parameters.
+
+    Raises:
+        ValueError: a parameter's moments or step count are missing, of another shape, of no parameter, or below 0.
+    """
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in saved.items():
         index, name = key.split(".", 1)
         state.setdefault(int(index), {})[name] = torch.from_numpy(np.array(value))
+    for index, slots in state.items():
+        shape = parameters[index].shape if 0 <= index < len(parameters) else None
+        wanted = {**dict.fromkeys(_MOMENTS, shape), "step": torch.Size()}
+        if {name: slot.shape for name, slot in slots.items()} != wanted or slots["step"] < 0:
+            raise ValueError(f"an optimiser's moments of parameter {index} do not fit it")
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})

@@ -19,7 +19,7 @@ from popgen.envs.base import EnvSpec
 from popgen.rllib.job import Group, Job
 from popgen.rllib.learner import PooledLearner
 from popgen.rllib.module import module_id, module_spec, spaces
-from popgen.rllib.partners import PartnerReturns
+from popgen.rllib.partners import PartnerEpisodes
 from popgen.rllib.pooling import Plan
 from popgen.rllib.runner import BatchedRunner, Failure
 from popgen.rllib.slots import Rollout
@@ -27,6 +27,10 @@ from popgen.types import Kind
 
 ATTEMPTS = 5
 """Requests to the runners that may fail one after the other before the run does."""
+
+
+class RunnerError(RuntimeError):
+    """A runner could not do what it was asked for."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +53,13 @@ class Report:
         counted: every environment step that came back, once.
         figures: member -> figures for the logs.
         seconds: sampling, learning, and of the latter pooling and gradients.
+        lost: runners that did not answer, whose share is missing.
     """
 
     counted: list[Counted] = field(default_factory=list)
     figures: dict[int, dict[str, float]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    lost: list[int] = field(default_factory=list)
 
 
 class MappoConfig(PPOConfig):
@@ -67,8 +73,9 @@ class MappoConfig(PPOConfig):
 
     @classmethod
     def of(cls, job: Job, spec: EnvSpec, cluster: ClusterConfig) -> Self:
-        """The whole configuration of one training."""
-        logging.getLogger("ray.rllib").setLevel(logging.ERROR)  # it warns of defaults that are meant here
+        """The whole configuration of one training; with `cluster.agent_gpus` the learner is on this process's card."""
+        # It warns of defaults that are meant here, and of runners' deaths, which the report tells.
+        logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
         config, ppo = cls(), job.ppo
         config.job, config.env_spec, config.runner_threads = job, spec, cluster.threads
         observation, action = spaces(job, spec)
@@ -84,7 +91,7 @@ class MappoConfig(PPOConfig):
             broadcast_env_runner_states=False,
         )
         config.fault_tolerance(restart_failed_env_runners=True, env_runner_health_probe_timeout_s=60.0)
-        config.learners(learner_class=PooledLearner, num_learners=0, num_gpus_per_learner=0)
+        config.learners(learner_class=PooledLearner, num_learners=0, num_gpus_per_learner=cluster.agent_gpus)
         config.training(
             lr=ppo.learning_rate,
             gamma=ppo.discount,
@@ -125,18 +132,25 @@ class Mappo(PPO):
         self.job: Job = self.config.job
         self.groups = self.job.groups()
         diversity, ppo = self.job.diversity, self.job.ppo
-        window = diversity.window if diversity else 1
-        self.partners = {m: PartnerReturns(self.job.partners(m), window) for m in self.job.learning}
+        # All fresh episodes count, or those of one seating alone would be left of many.
+        window = None if self.job.fresh or diversity is None else diversity.window
+        self.partners = {m: PartnerEpisodes(self.job.partners(m), window) for m in self.job.learning}
         self.strongest: dict[int, int] = {}
         self.own: dict[int, deque[float]] = {m: deque(maxlen=ppo.window) for m in self.job.learning}
         self.rng = np.random.default_rng(self.job.seed)
+        self.taken = dict.fromkeys(self.job.learning, 0)  # self-play steps
+        self.lost: set[int] = set()
         self.rounds, self.report = 0, Report()
+
+    def _setup_logdir(self) -> None:
+        """Nothing: RLlib would make an empty folder in the user's home for every training."""
 
     # ---- one iteration -------------------------------------------------------------------------------------------
 
     def training_step(self) -> None:
         """Partners, rollouts, update; see `report`."""
         began, ppo = time.perf_counter(), self.job.ppo
+        self.lost.clear()
         counted: list[Counted] = []
         weights = self._learner(lambda learner: learner.actors())
         if self._selects():
@@ -153,12 +167,12 @@ class Mappo(PPO):
             figures[member] = figures.get(member, {}) | self.scores(member)
         seconds = {"sampling": sampled - began, "learning": learned - sampled}
         seconds |= self._learner(lambda learner: learner.seconds)
-        self.report = Report(counted, figures, seconds)
+        self.report = Report(counted, figures, seconds, sorted(self.lost))
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is used up."""
-        return self.rounds * self.job.ppo.envs * self.job.ppo.steps / self.job.ppo.max_steps
+        """Share of the budget that every member's self-play has used up."""
+        return min(self.taken.values()) / self.job.ppo.max_steps
 
     @property
     def finished(self) -> bool:
@@ -225,22 +239,30 @@ class Mappo(PPO):
             self.restore_env_runners(self.env_runner_group)
         if not found:
             raise RayActorError(error_msg=f"no runner answered {ATTEMPTS} times")
-        for _, answer in found:
-            if isinstance(answer, Failure):
-                raise RuntimeError(f"a runner failed:\n{answer.text}")
-        for runner, rollout in found:
+        rollouts = [(runner, answer) for runner, answer in found if answer is not None]
+        for runner, rollout in rollouts:
             counted += self._count(runner, rollout, listen=what == "episodes" or not self.job.fresh)
-        return [rollout for _, rollout in found]
+        return [rollout for _, rollout in rollouts]
 
-    def _ask(self, what: str, request: Mapping[str, Any]) -> list[tuple[int, Any]]:
+    def _ask(self, what: str, request: Mapping[str, Any], only: list[int] | None = None) -> list[tuple[int, Any]]:
+        """Answers of the runners (`only` some of them), in their order; those that did not answer are `lost`.
+
+        Raises:
+            RunnerError: one of them could not do it.
+        """
         group = self.env_runner_group
-        if not group.num_remote_env_runners():
-            return [(0, getattr(group.local_env_runner, what)(**request))]
-        if "weights" in request:  # one copy for all runners
-            request = {**request, "weights": ray.put(request["weights"])}
-        answers = group._worker_manager.foreach_actor(what, kwargs=request, healthy_only=True)
-        group._worker_manager.handle_remote_call_result_errors(answers, ignore_ray_errors=True)
-        return sorted((answer.actor_id, answer.get()) for answer in answers if answer.ok)
+        if group.num_remote_env_runners():
+            if "weights" in request:  # one copy for all runners
+                request = {**request, "weights": ray.put(request["weights"])}
+            answers = group._worker_manager.foreach_actor(what, kwargs=request, remote_actor_ids=only)
+            found = {answer.actor_id: answer.get() for answer in answers if answer.ok}
+            self.lost |= set(group._worker_manager.actor_ids() if only is None else only) - found.keys()
+        else:
+            found = {0: getattr(group.local_env_runner, what)(**request)}
+        for runner, answer in found.items():
+            if isinstance(answer, Failure):
+                raise RunnerError(f"runner {runner} failed:\n{answer.text}")
+        return sorted(found.items())
 
     def restore_env_runners(self, env_runner_group: Any) -> list[int]:
         """Find runners that Ray has restarted; their weights come with the next request."""
@@ -250,7 +272,10 @@ class Mappo(PPO):
         """Steps and episodes by owner and kind; scores to the windows, cross-play's where `listen`."""
         steps: dict[tuple[int, Kind], list[float]] = defaultdict(lambda: [0, 0, 0.0])
         for group in rollout.groups:
-            steps[group.owner, group.kind][0] += len(rollout.reward) * group.envs
+            played = len(rollout.reward) * group.envs
+            steps[group.owner, group.kind][0] += played
+            if group.kind is Kind.SP:
+                self.taken[group.owner] += played
         for episode in rollout.episodes:
             group = rollout.groups[episode.group]
             total = steps[group.owner, group.kind]
@@ -287,23 +312,26 @@ class Mappo(PPO):
             "runners": {str(index): state for index, state in runners.items()},
             "partners": {str(m): known.state() for m, known in self.partners.items()},
             "own": {str(m): list(scores) for m, scores in self.own.items()},
+            "taken": {str(m): steps for m, steps in self.taken.items()},
             "rng": self.rng.bit_generator.state,
             "rounds": self.rounds,
         }
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        """Go on from `snapshot()` of an algorithm of the same job."""
+        """Go on from `snapshot()` of an algorithm of the same job.
+
+        Raises:
+            KeyError, ValueError: it is of another job.
+        """
         self._learner(lambda learner: learner.restore(state["learner"]))
-        group = self.env_runner_group
         for index, saved in state["runners"].items():
-            if int(index) == 0:
-                group.local_env_runner.restore(state=saved)
-            else:
-                group.foreach_env_runner(
-                    "restore", kwargs={"state": saved}, local_env_runner=False, remote_worker_ids=[int(index)]
-                )
+            try:
+                self._ask("restore", {"state": saved}, only=[int(index)])
+            except RunnerError as error:
+                raise ValueError(str(error).strip().rpartition("\n")[2]) from None
         for member in self.job.learning:
             self.partners[member].load_state(state["partners"][str(member)])
             self.own[member].extend(state["own"][str(member)])
+            self.taken[member] = int(state["taken"][str(member)])
         self.rng.bit_generator.state = state["rng"]
         self.rounds = int(state["rounds"])

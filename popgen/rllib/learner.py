@@ -78,13 +78,15 @@ class PooledLearner(PPOTorchLearner):
                 value_decay=ppo.value_decay,
             )
             if batch is not None:
-                batches[member] = batch
+                batches[member] = batch.to(self._device)
                 self._figures[member] = dict(batch.figures)
-        steps = sum(rollout.steps for rollout in training_data.episodes) // ppo.minibatches
+        # With a runner lost there may be fewer rows than minibatches.
+        count = min([ppo.minibatches, *(len(batch.action) for batch in batches.values())])
+        steps = sum(rollout.steps for rollout in training_data.episodes) // count
         self.seconds["pooling"] = time.perf_counter() - began
         for _ in range(ppo.epochs):
-            parts = {m: batch.minibatches(ppo.minibatches, self._order) for m, batch in batches.items()}
-            for _ in range(ppo.minibatches):
+            parts = {m: batch.minibatches(count, self._order) for m, batch in batches.items()}
+            for _ in range(count):
                 yield _Minibatch({module_id(m): _Rows(next(rows)) for m, rows in parts.items()}, max(1, steps))
 
     def _update(self, batch: dict[str, Any], **kwargs: Any) -> Any:
@@ -110,7 +112,7 @@ class PooledLearner(PPOTorchLearner):
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
         values = fwd_out[Columns.VF_PREDS]
         errors = [0.5 * (values[name] - rows.target).square().mean() for name, rows in batch[CRITICS].items()]
-        value = torch.stack(errors).sum() if errors else torch.zeros(())
+        value = torch.stack(errors).sum() if errors else policy.new_zeros(())
         with torch.no_grad():
             ratio = log_prob - batch["log_prob"]
             figures = {

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 
-class PartnerReturns:
-    """Returns of the latest episodes with each partner, both seatings together.
+class PartnerEpisodes:
+    """Returns and scores of the latest episodes with each partner, both seatings together.
 
     Args:
         partners: members.
-        window: episodes remembered of each.
+        window: episodes remembered of each; None remembers all since `forget`.
     """
 
-    def __init__(self, partners: Sequence[int], window: int) -> None:
+    def __init__(self, partners: Sequence[int], window: int | None) -> None:
         self.returns: dict[int, deque[float]] = {partner: deque(maxlen=window) for partner in partners}
         self.scores: dict[int, deque[float]] = {partner: deque(maxlen=window) for partner in partners}
 

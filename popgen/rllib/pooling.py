@@ -11,7 +11,7 @@ would drown a beginner's self-play, whose returns are small beside what a traine
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -136,8 +136,10 @@ def advantages(
 
 @torch.no_grad()
 def _values(critic: ValueNet, obs: Tensor, extras: Tensor) -> Tensor:
+    """(R,), in this process's memory wherever the critic is."""
+    device = critic.mean.device
     parts = zip(obs.split(CHUNK), extras.split(CHUNK), strict=True)
-    return torch.cat([critic.value(o, e) for o, e in parts])
+    return torch.cat([critic.value(o.to(device), e.to(device)).cpu() for o, e in parts])
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,10 @@ class CriticRows:
     obs: Tensor
     extras: Tensor
     target: Tensor
+
+    def to(self, device: torch.device) -> CriticRows:
+        """On a learner's device."""
+        return CriticRows(self.obs.to(device), self.extras.to(device), self.target.to(device))
 
 
 @dataclass(frozen=True)
@@ -172,6 +178,11 @@ class Batch:
     cross: Tensor
     critics: dict[str, CriticRows]
     figures: dict[str, float]
+
+    def to(self, device: torch.device) -> Batch:
+        """On a learner's device."""
+        moved = {f.name: v.to(device) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return replace(self, **moved, critics={name: rows.to(device) for name, rows in self.critics.items()})
 
     def minibatches(self, parts: int, generator: torch.Generator) -> Iterator[dict[str, object]]:
         """One epoch in `parts` batches, every row once; policy rows and each critic's are shuffled on their own."""
@@ -227,14 +238,14 @@ def pool(
         centred = torch.zeros_like(advantage)
         centred[counted] = signed_advantage(kind, chosen - chosen.mean(), weight=weight, scale=scale)
         parts.append(_policy_rows(found, centred, kind))
-        critic.see(returns[counted], value_decay)
+        critic.see(returns[counted].to(critic.mean.device), value_decay)
         rows[name] = _critic_rows(found, critic, returns, counted, view)
         told = str(kind).lower()
         figures |= {
             f"{told}_reward": float(found.reward[counted].mean()),
             f"{told}_advantage_std": float(chosen.std(correction=0)),
+            f"{told}_explained": _explained(chosen, returns[counted]),
         }
-        figures[f"{told}_explained"] = _explained(advantage[counted], returns[counted])
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
@@ -258,7 +269,7 @@ def _policy_rows(found: Trajectories, advantage: Tensor, kind: Kind) -> dict[str
 
 def _critic_rows(found: Trajectories, critic: ValueNet, returns: Tensor, counted: Tensor, view: ViewSpec) -> CriticRows:
     seats = torch.eye(found.actions.shape[-1])[found.seat].expand(*counted.shape, -1)
-    target = critic.normalised(returns[counted])
+    target = critic.normalised(returns[counted].to(critic.mean.device))
     return CriticRows(joint(found.obs[:-1], view)[counted], seats[counted], target)
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,22 @@ from popgen.rllib.slots import Actor, Rollout, SlotPool
 
 @dataclass(frozen=True)
 class Failure:
-    """What went wrong in a runner. RLlib would turn an exception into an empty list of samples."""
+    """What went wrong in a runner. At an exception RLlib would end the process after a minute, and start it again."""
 
     text: str
+
+
+def never_raises(method: Callable[..., Any]) -> Callable[..., Any]:
+    """The method, which answers with a `Failure` where it would raise an exception."""
+
+    @wraps(method)
+    def call(*arguments: Any, **given: Any) -> Any:
+        try:
+            return method(*arguments, **given)
+        except Exception:
+            return Failure(traceback.format_exc())
+
+    return call
 
 
 class BatchedRunner(EnvRunner):
@@ -50,6 +64,7 @@ class BatchedRunner(EnvRunner):
         self.module = module_spec(job, self.spec, inference_only=True).build()
         self.frozen: dict[int, Actor] = {member: self._actor(weights) for member, weights in job.frozen.items()}
 
+    @never_raises
     def sample(
         self,
         *,
@@ -57,24 +72,22 @@ class BatchedRunner(EnvRunner):
         active: Sequence[int] = (),
         steps: int = 0,
         **kwargs: Any,
-    ) -> Rollout | Failure:
+    ) -> Rollout:
         """`steps` steps of this runner's environments of the groups `active`, with the learners' `weights`."""
-        try:
-            return self.pool.play(active, steps, self._actors(weights or {}))
-        except Exception:  # told to the algorithm, which ends the run
-            return Failure(traceback.format_exc())
+        return self.pool.play(active, steps, self._actors(weights or {}))
 
+    @never_raises
     def episodes(
         self, *, weights: Mapping[int, Weights], groups: Sequence[Group], seed: int, **kwargs: Any
-    ) -> Rollout | Failure:
-        """One horizon from the start in fresh environments of this runner's share of `groups`."""
-        try:
-            mine = [group for group in share(list(groups), self.parts, self.part) if group.envs]
-            drawn = int(np.random.SeedSequence([seed, self.part]).generate_state(1)[0])
-            pool = SlotPool(self._make, mine, self.job.ppo.view, seed=drawn, stagger=False)
-            return pool.play(range(len(mine)), self.spec.horizon, self._actors(weights))
-        except Exception:
-            return Failure(traceback.format_exc())
+    ) -> Rollout | None:
+        """An episode from the start in each of this runner's share of the environments of `groups`, all of which are
+        stepped for one horizon; None where it has no share."""
+        mine = [group for group in share(list(groups), self.parts, self.part) if group.envs]
+        if not mine:
+            return None
+        drawn = int(np.random.SeedSequence([seed, self.part]).generate_state(1)[0])
+        pool = SlotPool(self._make, mine, self.job.ppo.view, seed=drawn, stagger=False, once=True)
+        return pool.play(range(len(mine)), self.spec.horizon, self._actors(weights))
 
     def _actors(self, weights: Mapping[int, Weights]) -> dict[int, Actor]:
         actors = dict(self.frozen)
@@ -96,10 +109,12 @@ class BatchedRunner(EnvRunner):
 
     # ---- what RLlib asks for -------------------------------------------------------------------------------------
 
+    @never_raises
     def snapshot(self) -> dict[str, Any]:
         """The running episodes and generators."""
         return self.pool.state()
 
+    @never_raises
     def restore(self, *, state: Mapping[str, Any]) -> None:
         """Go on from `snapshot()` of this runner."""
         self.pool.load_state(state)

@@ -77,6 +77,8 @@ class SlotPool:
         view: what the members look at.
         seed: of environments, actions and switch points.
         stagger: spread the first ends of episodes over the horizon.
+        once: tell of the first episode of every environment alone. Of all that end within a given time, short ones are
+            more than their share.
     """
 
     def __init__(
@@ -87,8 +89,9 @@ class SlotPool:
         *,
         seed: int,
         stagger: bool = True,
+        once: bool = False,
     ) -> None:
-        self.make, self.groups, self.view = make, tuple(groups), view
+        self.make, self.groups, self.view, self.once = make, tuple(groups), view, once
         self._envs: dict[int, BatchedEnv] = {}
         self._rng = np.random.default_rng(seed)
         self._draws = torch.Generator().manual_seed(seed)
@@ -240,7 +243,8 @@ class _Run:
             self.episodes.append(Ended(int(self.group[column]), float(self.score[column]), float(self.reward[column])))
         self.env.reset(indices=columns)
         self.obs[t + 1, columns] = self.env.encode(self.env.get_state(columns), self.pool.view)
-        self.age[columns], self.score[columns], self.reward[columns], self.whole[columns] = 0, 0.0, 0.0, True
+        self.age[columns], self.score[columns], self.reward[columns] = 0, 0.0, 0.0
+        self.whole[columns] = not self.pool.once
         self.switch[columns] = self.pool.switches(len(columns))
 
     def finish(self) -> Rollout:

@@ -23,9 +23,6 @@ ACTORS = {
 }
 """Who is killed -> method -> what its process is called; a method without an entry has no such actor."""
 
-RAY_ENDED_US = 1
-"""Exit code of a driver whose process Ray ended, because its raylet was dead."""
-
 
 @dataclass
 class Hit:
@@ -164,22 +161,22 @@ def kill_node(hit: Hit) -> None:
     hit.wait(process)
 
 
-def kill_local_raylet(hit: Hit) -> None:
-    """kill -9 of the raylet of the driver's own Ray: the driver starts another one.
+def kill_local(name: str) -> Callable[[Hit], None]:
+    """kill -9 of a process of the driver's own Ray: the driver starts another one, or is made again where Ray's library
+    ended it."""
 
-    Where Ray's library was just talking to the raylet it ends the driver's process as well, without a word; the same
-    run id is submitted again then.
-    """
-    hit.place = ("cluster=laptop", "cluster.num_cpus=4")
-    process = hit.start()
-    if hit.reached(process):
-        for child in psutil.Process(process.pid).children(recursive=True):
-            if child.name() == "raylet":
-                hit.victim, hit.struck = "raylet", True
-                end(child)
-                break
-    if hit.wait(process) == RAY_ENDED_US and hit.struck and not hit.told:
-        hit.wait(hit.start())
+    def act(hit: Hit) -> None:
+        hit.place = ("cluster=laptop", "cluster.num_cpus=4")
+        process = hit.start()
+        if hit.reached(process):
+            for child in psutil.Process(process.pid).children(recursive=True):
+                if child.name() == name:
+                    hit.victim, hit.struck = name, True
+                    end(child)
+                    break
+        hit.wait(process)
+
+    return act
 
 
 def fill_disk(reserve: int) -> Callable[[Hit], None]:
@@ -263,7 +260,8 @@ FAULTS = {
         Fault("driver kill -9", signal_driver(signal.SIGKILL)),
         Fault("driver SIGTERM", signal_driver(signal.SIGTERM)),
         Fault("node", kill_node),
-        Fault("local raylet", kill_local_raylet),
+        Fault("local raylet", kill_local("raylet")),
+        Fault("local control store", kill_local("gcs_server")),
         Fault("disk full", fill_disk(0), is_root, one_line=True),
         Fault("disk nearly full", fill_disk(64 * 2**20), is_root, one_line=True),
         Fault("damaged checkpoint", damage_checkpoint, lambda method: method.startswith("xpm")),

@@ -83,13 +83,20 @@ def damage(folder: Path, how: str) -> None:
         values.write_text(values.read_text().replace("replay/arrays/states", "replay/arrays/stakes"))
     elif how == "a list":
         values.write_text(json.dumps([1, 2]))
+    elif how == "no digests":
+        values.write_text(json.dumps(json.loads(values.read_text())["values"]))
+    elif how == "digests of nothing":
+        values.write_text(json.dumps(json.loads(values.read_text()) | {"sha256": {}}))
+    elif how == "a device":
+        arrays.unlink()
+        arrays.symlink_to("/dev/zero")
 
 
 @pytest.mark.parametrize(
     "how",
     [
         *("cut arrays", "header", "empty arrays", "no arrays", "cut values", "no values", "not text", "another array"),
-        "a list",
+        *("a list", "no digests", "digests of nothing", "a device"),
     ],
 )
 def test_a_damaged_checkpoint_is_one_line(tmp_path: Path, how: str) -> None:

@@ -163,6 +163,18 @@ def test_a_bad_copy_is_one_line_and_nothing_is_written(tmp_path: Path, place: st
     assert "\n" not in str(caught.value) and not run.exists() and not (tmp_path / "evil").exists()
 
 
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b"[]", b"\xff", b'{"format": 1}', b'{"format": 1, "writer": "x", "files": {"a": 3}}']
+)
+def test_a_list_of_files_that_is_none_is_one_line(tmp_path: Path, place: str, content: bytes) -> None:
+    run = make_run(tmp_path)
+    Mirror(run, place).push()
+    (tmp_path / "store" / "r" / LATEST).write_bytes(content)
+    with pytest.raises(UserError, match=f"run.storage: .*{LATEST} is unreadable") as caught:
+        Mirror(run, place).pull()
+    assert "\n" not in str(caught.value) and (run / "ledger.jsonl").read_text() == "one\n"
+
+
 def test_a_turned_bit_is_noticed(tmp_path: Path, place: str) -> None:
     run = make_run(tmp_path)
     Mirror(run, place).push()

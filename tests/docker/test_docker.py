@@ -18,7 +18,17 @@ from popgen.cli.compose import compose
 
 DOCKER = ROOT / "docker"
 ENTRY = DOCKER / "entrypoint.sh"
-INSTRUCTIONS = {"FROM", "ARG", "ENV", "RUN", "COPY", "WORKDIR", "USER", "ENTRYPOINT", "CMD"}
+INSTRUCTIONS = {"FROM", "SHELL", "ARG", "ENV", "RUN", "COPY", "WORKDIR", "USER", "ENTRYPOINT", "CMD"}
+COMPOSE = {
+    "": "name services volumes networks",
+    "services": "image build command entrypoint environment ports volumes networks depends_on healthcheck deploy "
+    "profiles restart init shm_size stop_grace_period security_opt cap_drop",
+    "build": "context dockerfile target",
+    "healthcheck": "test interval timeout retries start_period",
+    "deploy": "replicas resources",
+}
+"""Part of a Compose file -> the keys of the specification that ours may have; another one is most likely a slip."""
+
 ROLES = ("head", "worker", "run", "mlflow", "health")
 TOKEN = "0123456789abcdef" * 4
 
@@ -58,6 +68,27 @@ def lineage(name: str) -> list[tuple[str, str]]:
 def test_the_dockerfile_has_known_instructions_and_a_syntax() -> None:
     assert (DOCKER / "Dockerfile").read_text().startswith("# syntax=docker/dockerfile:1.")
     assert {word for word, _ in instructions()} <= INSTRUCTIONS  # no ADD, which may fetch from anywhere
+
+
+def test_the_dockerfile_keeps_the_rules_of_linters() -> None:
+    """What hadolint asks for, as far as it applies: the numbers are its rules'."""
+    for word, rest in instructions():
+        if word in ("CMD", "ENTRYPOINT", "SHELL"):
+            assert isinstance(yaml.safe_load(rest), list), rest  # DL3025: the form without a shell
+        if word == "WORKDIR":
+            assert rest.startswith("/"), rest  # DL3000
+        if word in ("ARG", "ENV"):
+            assert not re.search("token|password|secret", rest, re.IGNORECASE), rest
+        if word != "RUN":
+            continue
+        assert not re.search(r"\b(sudo|cd|apt)\s", rest), rest  # DL3004, DL3003, DL3027
+        if "apt-get" in rest:  # DL3009, DL3014, DL3015, and the list of packages is of the same layer
+            assert rest.startswith("apt-get update") and "install -y --no-install-recommends" in rest
+            assert "rm -rf /var/lib/apt/lists/*" in rest
+        if "pip install" in rest:  # DL3042: no cache of pip's in a layer
+            assert "--mount=type=cache,target=/root/.cache/pip" in rest or "--no-cache-dir" in rest
+        if " | " in rest:  # DL4006
+            assert all(("SHELL", '["/bin/bash", "-o", "pipefail", "-c"]') in lineage(name) for name in stages())
 
 
 def test_the_base_is_pinned_and_fits_the_project() -> None:
@@ -150,6 +181,19 @@ def test_every_service_is_complete() -> None:
         assert word == name and word in ROLES
         for port in service.get("ports", []):
             assert port.startswith("127.0.0.1:")  # never on the host's other addresses
+
+
+@pytest.mark.parametrize("name", ["compose.yaml", "compose.gpu.yaml"])
+def test_compose_files_have_keys_of_the_specification(name: str) -> None:
+    content = load(name)
+    top = {key for key in content if not key.startswith("x-")}
+    assert top <= set(COMPOSE[""].split())
+    for service in content["services"].values():
+        assert service.keys() <= set(COMPOSE["services"].split())
+        for part in ("build", "healthcheck", "deploy"):
+            assert service.get(part, {}).keys() <= set(COMPOSE[part].split())
+    for name in ("volumes", "networks"):
+        assert all(value is None for value in content.get(name, {}).values())  # made by Compose, with its defaults
 
 
 def test_health_checks_ask_the_entry_script() -> None:

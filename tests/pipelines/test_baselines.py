@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sqlite3
 import subprocess
 import sys
+import time
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import ray
+import torch
 
-from pipelines import baselines
+from pipelines import baselines, checkpoints
 from pipelines.books import Books
 from pipelines.population import driver_class, run_population
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
+from popgen.config import ClusterConfig, RunConfig
 from popgen.data.ledger import Ledger
 from popgen.envs import make_env
 from popgen.errors import UserError
@@ -25,6 +31,7 @@ from popgen.population import Population, load_population
 from popgen.preflight import preflight
 from popgen.progress import NullReporter
 from popgen.rllib.algorithm import Mappo as Algorithm
+from popgen.rllib.job import Job
 
 HORIZON = 40
 SP_STEPS = 240
@@ -43,8 +50,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("runs")
 
 
-def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
-    base = ["scale=smoke", "tracking=off", f"env.params.horizon={HORIZON}", "seed=3", "evaluation.episodes=1"]
+def smoke(root: Path, name: str, *overrides: str, scale: str = "smoke") -> RunConfig:
+    base = [f"scale={scale}", "tracking=off", f"env.params.horizon={HORIZON}", "seed=3", "evaluation.episodes=1"]
     return RunConfig.parse(compose([*base, f"run.root={root}", f"run.id={name}", *overrides]))
 
 
@@ -54,6 +61,7 @@ class Run:
 
     dir: Path
     said: Counter[tuple[int, str]]
+    notes: list[str] = field(default_factory=list)
 
     @property
     def population(self) -> Population:
@@ -63,13 +71,37 @@ class Run:
         """All entries, but for what tells attempts apart."""
         return [(e.member, e.kind, e.sequence, e.steps, e.episodes, e.score) for e in Ledger(self.dir / "ledger.jsonl")]
 
+    def counted(self) -> Counter[tuple[int, str]]:
+        """The ledger's totals by member and kind."""
+        found: Counter[tuple[int, str]] = Counter()
+        for entry in Ledger(self.dir / "ledger.jsonl"):
+            found[entry.member, str(entry.kind)] += entry.steps
+        return found
+
     def sha256s(self) -> list[str]:
         return [info.policy_sha256 for info in self.population.members]
 
 
-def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Run:
+class Notes(NullReporter):
+    """Keeps what was told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+def launch(
+    root: Path,
+    name: str,
+    *overrides: str,
+    die_at: str = "",
+    scale: str = "smoke",
+    before: Callable[[int, Algorithm], None] = lambda iteration, algorithm: None,
+) -> Run:
     """Train without the evaluation after it. It dies at the beginning of the N-th call of METHOD (`METHOD:N`)."""
-    config = smoke(root, name, *overrides)
+    config, reporter = smoke(root, name, *overrides, scale=scale), Notes()
     calls: Counter[str] = Counter()
     said: Counter[tuple[int, str]] = Counter()
 
@@ -82,6 +114,7 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Run:
 
         def train(self: Algorithm, original: Any = Algorithm.train) -> Any:
             called("train")
+            before(calls["train"], self)
             result = original(self)
             for counted in self.report.counted:
                 said[counted.owner, str(counted.kind)] += counted.steps
@@ -97,15 +130,16 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Run:
             called("added")
 
         patch.setattr(Algorithm, "train", train)
-        patch.setattr(baselines, "save_state", save)
+        for module in (baselines, checkpoints):
+            patch.setattr(module, "save_state", save)
         patch.setattr(Books, "add_member", add)
         spec = make_env(config.env.name, 1, **config.env.params).spec
         books = Books(config, spec)
         try:
-            driver_class(config.method)(config, spec, books, NullReporter()).run()
+            driver_class(config.method)(config, spec, books, reporter).run()
         finally:
             books.close("FINISHED")
-    return Run(books.dir, said)
+    return Run(books.dir, said, reporter.notes)
 
 
 SIZES = {"mappo": "population.size=2", "lipo": "population.size=3", "comedi": "population.size=3"}
@@ -119,10 +153,7 @@ def runs(root: Path) -> dict[str, Run]:
 @pytest.mark.parametrize("method", SIZES)
 def test_the_ledger_holds_what_the_runners_stepped(method: str, runs: dict[str, Run]) -> None:
     run = runs[method]
-    counted: Counter[tuple[int, str]] = Counter()
-    for entry in Ledger(run.dir / "ledger.jsonl"):
-        counted[entry.member, str(entry.kind)] += entry.steps
-    assert counted == run.said
+    assert run.counted() == run.said
     for member in run.population.members:
         row = {kind: steps for (owner, kind), steps in run.said.items() if owner == member.id}
         assert member.steps == row and row["SP"] == SP_STEPS and member.seed == 3000 + member.id
@@ -185,11 +216,94 @@ def test_sequential_lipo_meets_its_predecessors_only(root: Path) -> None:
     assert "critics.XP_1.mean" in (run.population.training(2) or {})
 
 
+METHODS = {
+    "concurrent": ("method=lipo",),
+    "sequential": ("method=lipo", "diversity.order=sequential"),
+    "comedi": ("method=comedi",),
+}
+
+
+@pytest.mark.parametrize("kind", METHODS)
+def test_rendezvous(kind: str, root: Path) -> None:
+    """An environment without weighted events, whose episodes can terminate."""
+    run = launch(root, f"rendezvous_{kind}", *METHODS[kind], "env=rendezvous/mppmr", "population.size=3")
+    assert run.counted() == run.said and len(set(run.sha256s())) == 3
+    fresh = 2 * 2 * HORIZON * (kind == "comedi")
+    strongest = kind == "comedi"  # alone is met in training
+    for member in (1, 2, 3):
+        partners = member - 1
+        assert run.said[member, "SP"] == SP_STEPS
+        met = min(partners, 1) if strongest else partners
+        assert run.said[member, "XP"] == met * SP_STEPS + partners * fresh
+        assert run.said[member, "MP"] == (SP_STEPS if strongest and partners else 0)
+    env = run.population.make_env(2)
+    for policy in run.population:
+        policy.reset(2, 0)
+        actions = policy.act(env.observe(policy.view), np.zeros((2, 2), np.uint8), np.ones(2, bool))
+        assert actions.shape == (2, 2)
+
+
+def test_without_weight_there_is_no_mixed_play(root: Path) -> None:
+    run = launch(root, "unmixed", "method=comedi", "population.size=2", "diversity.lambda_mp=0")
+    assert run.said == {(1, "SP"): SP_STEPS, (2, "SP"): SP_STEPS, (2, "XP"): SP_STEPS + 2 * 2 * HORIZON}
+
+
+PAPER_BUT_SHORT = (
+    *("ppo.envs=2", "ppo.steps=10", "ppo.epochs=1", "ppo.minibatches=2", "ppo.max_steps=40"),
+    *("diversity.xp_envs=2", "diversity.mp_envs=2", "diversity.select_episodes=1", "population.size=2"),
+)
+
+
+@pytest.mark.parametrize("method", ["mappo", "lipo", "comedi"])
+def test_the_papers_sizes_train(method: str, root: Path) -> None:
+    """The convolutional networks of `scale=paper`, for a few steps; the member acts on the grid."""
+    run = launch(root, f"paper_{method}", f"method={method}", *PAPER_BUT_SHORT, scale="paper")
+    assert run.counted() == run.said and run.said[2, "SP"] == 40
+    policy = run.population[2]
+    assert policy.view == "lossless" and policy.config()["kernels"] == [5, 3, 3] and policy.config()["units"] == 512
+    env = run.population.make_env(2)
+    policy.reset(2, 0)
+    actions = policy.act(env.observe("lossless"), np.zeros((2, 2), np.uint8), np.ones(2, bool))
+    assert actions.shape == (2, 2)
+    rows = [json.loads(line) for line in (run.dir / "metrics.jsonl").open()]
+    assert len(rows) == 4  # two iterations of each member
+    assert all(np.isfinite(row["ppo/policy_loss"]) and row["ppo/value_loss"] > 0 for row in rows)
+
+
+def test_a_killed_runner_costs_no_step_and_counts_none_twice(root: Path) -> None:
+    """Two remote runners, one of them killed in the second iteration: the ledger is what came back, and reaches the
+    budget."""
+
+    def kill(iteration: int, algorithm: Algorithm) -> None:
+        if iteration == 2:
+            ray.kill(algorithm.env_runner_group._worker_manager.actors()[2], no_restart=False)
+
+    overrides = ("method=lipo", "population.size=2", "ppo.runners=2", "cluster.sampler_cpus=0.1", "ppo.max_steps=400")
+    run = launch(root, "shot", *overrides, before=kill)
+    assert run.counted() == run.said
+    samplers = {entry.sampler.split(".")[0] for entry in Ledger(run.dir / "ledger.jsonl")}
+    assert samplers == {"runner1", "runner2"} and len(run.population) == 2
+    for member in (1, 2):  # an iteration is 80 steps, of which a lost share may be missing
+        assert 400 <= run.said[member, "SP"] < 480
+    assert run.said[2, "XP"] == run.said[2, "SP"]
+    # Each runner has half of both members' self-play and of their cross-play: three entries of 40 steps.
+    steps = [entry.steps for entry in Ledger(run.dir / "ledger.jsonl")]
+    told = [text for text in run.notes if text.startswith("runner 2 was lost")]
+    iterations = sum(json.loads(line)["member"] == 1 for line in (run.dir / "metrics.jsonl").open())
+    assert steps == [40] * (6 * iterations - 3 * len(told)) and told
+
+
 def test_a_whole_run_is_evaluated(root: Path) -> None:
-    result = run_population(smoke(root, "whole", "method=lipo", "population.size=2"), reporter=NullReporter())
+    overrides = ("method=lipo", "population.size=2", "tracking.enabled=true")
+    result = run_population(smoke(root, "whole", *overrides), reporter=NullReporter())
     table = result["ledger"]
     assert {kind: table["2"][kind] for kind in ("SP", "XP")} == {"SP": SP_STEPS, "XP": SP_STEPS}
     assert table["2"]["evaluation"] > 0 and np.shape(result["matrix"]["mean"]) == (2, 2)
+    with sqlite3.connect(root / "whole" / "mlflow.db") as store:
+        statuses = [status for (status,) in store.execute("select status from runs")]
+        points = dict(store.execute("select key, count(*) from metrics group by key"))
+    assert statuses == ["FINISHED"] * 3  # the population, and each member nested in it
+    assert points["ppo/kl"] == 6 and points["real_sp"] > 0 and points["sp"] == points["xp"] == 1
 
 
 DEATHS = {"mappo": ("train:2", "save:4", "added:1"), "lipo": ("train:3", "added:2"), "comedi": ("train:5", "save:7")}
@@ -203,6 +317,97 @@ def test_a_killed_run_ends_as_one_that_was_not(method: str, die_at: str, root: P
         launch(root, name, f"method={method}", SIZES[method], die_at=die_at)
     run = launch(root, name, f"method={method}", SIZES[method])
     assert run.sha256s() == whole.sha256s() and run.ledger() == whole.ledger()
+
+
+def interrupted(root: Path, name: str) -> Path:
+    """A run of MAPPO that died before its third iteration, with two checkpoints."""
+    with pytest.raises(Killed):
+        launch(root, name, "method=mappo", SIZES["mappo"], die_at="train:3")
+    folder = root / name / "checkpoints"
+    assert len(list(folder.glob("progress_*"))) == 2
+    return folder
+
+
+def damage(folder: Path) -> None:
+    path = folder / "arrays.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(root: Path, runs: dict[str, Run]) -> None:
+    folder = interrupted(root, "damaged")
+    damage(max(folder.glob("progress_*")))
+    run = launch(root, "damaged", "method=mappo", SIZES["mappo"])
+    assert any("the checkpoint before it counts" in text for text in run.notes)
+    assert run.sha256s() == runs["mappo"].sha256s() and run.ledger() == runs["mappo"].ledger()
+
+
+def test_without_a_whole_checkpoint_it_is_told_in_one_line(root: Path) -> None:
+    folder = interrupted(root, "ruined")
+    for path in folder.glob("progress_*"):
+        damage(path)
+    with pytest.raises(UserError, match="unreadable checkpoint"):
+        launch(root, "ruined", "method=mappo", SIZES["mappo"])
+
+
+def test_a_ledger_that_lacks_entries_is_refused(root: Path) -> None:
+    interrupted(root, "short")
+    path = root / "short" / "ledger.jsonl"
+    path.write_text(path.read_text().splitlines(keepends=True)[0])
+    with pytest.raises(UserError, match="the checkpoint knows 2") as caught:
+        launch(root, "short", "method=mappo", SIZES["mappo"])
+    assert caught.value.field.endswith("ledger.jsonl")
+
+
+def test_a_checkpoint_of_other_sizes_is_refused(root: Path) -> None:
+    interrupted(root, "other")
+    for path in (root / "other" / "checkpoints").glob("progress_*"):
+        state = checkpoints.load_state(path)
+        state["algorithm"]["learner"]["modules"]["1"]["actor.0.weight"] = np.zeros((3, 3), np.float32)
+        checkpoints.save_state(path, state)
+    with pytest.raises(UserError, match="does not fit this run"):
+        launch(root, "other", "method=mappo", SIZES["mappo"])
+    shutil.rmtree(root / "other")
+
+
+def needs(*overrides: str, **cluster: Any) -> UserError:
+    """What is refused before the runners of CoMeDi's third member start."""
+    config = RunConfig.parse(compose(["method=comedi", "scale=smoke", *overrides]))
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    job = Job(config.env, config.ppo, config.diversity, (3,), 0, frozen={1: {}, 2: {}}, mixed=True, fresh=True)
+    with pytest.raises(UserError) as caught:
+        baselines.check_needs(job, spec, ClusterConfig(**cluster), lambda text: None)
+    return caught.value
+
+
+def test_what_the_machine_has_not_is_refused_before_any_runner_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as small:
+        small.setattr(baselines, "memory_bytes", lambda: 2**30)
+        assert needs("ppo.envs=1000", "ppo.steps=10000").field == "ppo.steps"
+        assert needs("diversity.select_episodes=100000").field == "diversity.select_episodes"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    card = needs(agent_gpus=1.0)
+    assert card.field == "cluster.agent_gpus" and "sees no GPU" in card.problem
+
+
+def test_runners_that_find_no_room_are_refused() -> None:
+    """Ray would let them wait for ever. Its two cores hold twenty of a tenth."""
+    few = needs("ppo.runners=3", "ppo.envs=4", sampler_cpus=1.0)
+    assert few.field == "ppo.runners" and few.problem == "3 that take 1 CPU each, Ray has room for 2"
+    custom = needs("ppo.runners=1", resources={"card": 1.0})
+    assert custom.problem == "1 that take 0.1 CPU and 1 card each, Ray has room for 0"
+    began = time.monotonic()
+    assert "room for 2" in needs("ppo.runners=3", sampler_cpus=1.0, address="auto", wait_seconds=0.0).problem
+    assert time.monotonic() - began < 5
+
+
+def test_places_are_counted_node_by_node() -> None:
+    nodes = [{"CPU": 2.0, "card": 1.0}, {"CPU": 1.5}, {}]
+    assert baselines.places({"CPU": 1.0}, nodes, 9) == 3
+    assert baselines.places({"CPU": 0.1}, nodes, 99) == 35 and baselines.places({"CPU": 0.1}, nodes, 4) == 4
+    assert baselines.places({"CPU": 1.0, "card": 1.0}, nodes, 9) == 1
+    assert baselines.places({}, nodes, 9) == 9
 
 
 def test_what_cannot_be_is_refused_before_anything_starts(root: Path) -> None:

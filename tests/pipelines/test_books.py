@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,25 @@ def test_another_config_needs_another_id(tmp_path: Path) -> None:
     assert books(tmp_path).attempt == 2
     with pytest.raises(UserError, match="r exists with another config"):
         books(tmp_path, lambda_xp=0.123)
+
+
+def test_lines_of_the_log_say_where_the_run_is(tmp_path: Path) -> None:
+    """Member 1 after its fourth iteration, then member 2, and nobody once the population is complete."""
+    kept = books(tmp_path)
+    kept.config = kept.config.model_copy(update={"population": kept.config.population.model_copy(update={"size": 2})})
+    kept.events.write("note")
+    kept.checkpointed(1, 4)
+    kept.events.write("note")
+    for member in (1, 2):
+        kept.add_member(RandomPolicy(SPEC.num_actions), None, seed=member, extra={})
+        kept.events.write("note")
+    kept.close("FINISHED")
+    rows = [json.loads(line) for line in (tmp_path / "r" / "run.log").read_text().splitlines()]
+    assert all(row["run"] == "r" and row["attempt"] == 1 for row in rows)
+    assert [(row["event"], row.get("member"), row.get("iteration")) for row in rows] == [
+        *(("start", 1, None), ("note", 1, None), ("checkpoint", 1, 4), ("note", 1, 4)),
+        *(("member", 1, 4), ("note", 2, None), ("member", 2, None), ("note", None, None), ("end", None, None)),
+    ]
 
 
 def test_half_a_point_is_dropped_and_repeated_points_count_once(tmp_path: Path) -> None:
@@ -84,3 +104,17 @@ def test_artefacts_of_a_run_that_goes_on_are_there_once_and_the_latest(tmp_path:
     assert (copies / "ledger.csv").read_text().split() == [
         *("member,kind,steps,episodes,score", "1,SP,7,0,0.0", "2,SP,14,0,0.0")
     ]
+
+
+def test_between_two_attempts_the_run_is_at_work(tmp_path: Path) -> None:
+    """An attempt that a death ended is no end of the run: should the driver be ended now, another one is made."""
+    first = books(tmp_path)
+    first.give_over(RuntimeError("an actor died"))
+    state = json.loads((tmp_path / "r" / "state.json").read_text())
+    assert (state["state"], state["error"], state["pid"]) == ("running", None, os.getpid())
+    last = [json.loads(line) for line in (tmp_path / "r" / "run.log").read_text().splitlines()][-1]
+    assert (last["event"], last["error"]) == ("end", "an actor died")
+    second = books(tmp_path)
+    assert second.attempt == 2
+    second.close("FINISHED")
+    assert json.loads((tmp_path / "r" / "state.json").read_text())["state"] == "finished"

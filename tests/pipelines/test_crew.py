@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
-from pipelines import crew
+from actors.sampler import PolicyParts
+from pipelines import crew, play
 from pipelines.play import seed_of
 from popgen.config import ClusterConfig
+from popgen.data.sampler import Team
 from popgen.errors import UserError
+from popgen.types import Kind
 
 HAVE = {"CPU": 8.0, "GPU": 1.0, "simulation": 6.0}
 
@@ -65,6 +71,26 @@ def test_a_local_ray_has_room_for_all_actors(monkeypatch: pytest.MonkeyPatch) ->
     for cluster in (ClusterConfig(), ClusterConfig(samplers=12, sampler_cpus=1.0), ClusterConfig(num_cpus=7)):
         assert crew.start_ray(cluster)
     assert [options["num_cpus"] for options in given] == [2, 14, 7]
+
+
+def test_weights_are_stored_once_for_each_version_whoever_plays_with_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samplers get references: what is behind one goes to a node once."""
+    stored: list[object] = []
+    opened: list[dict] = []
+    monkeypatch.setattr(play.ray, "put", lambda value: stored.append(value) or f"reference {len(stored)}")
+    monkeypatch.setattr(play.ray, "get", lambda references: None)
+
+    class Sampler:
+        open = SimpleNamespace(remote=lambda teams, parts, seed, stagger: opened.append(parts))
+
+    players = play.Players([Sampler()] * 3)
+    teams = [Team(Kind.XP, (1, 2), 6)]
+    old, first, second = ({"w": np.zeros(3)} for _ in range(3))
+    for newest in (first, first, second):
+        players.open(teams, {1: PolicyParts("k", {}, old), 2: PolicyParts("k", {}, newest)}, seed=0)
+    assert [parts.weights for parts in stored] == [old, first, second]
+    a, b, c = "reference 1", "reference 2", "reference 3"
+    assert opened == [{1: a, 2: b}] * 6 + [{1: a, 2: c}] * 3
 
 
 def test_samplers_have_seeds_of_their_own() -> None:

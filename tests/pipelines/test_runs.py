@@ -151,11 +151,18 @@ def test_seconds_are_those_of_all_attempts(folder: Path, monkeypatch: pytest.Mon
         ("config.json", b"[]"),
         ("config.json", b'{"method": "xpm_wm"}'),
         ("config.json", b"[" * 100_000),
+        ("config.json", b'{"method": 1, "scale": 1, "env": {"name": 1}, "population": {"size": Infinity}}'),
         ("state.json", b"[]"),
         ("state.json", b"\xff"),
+        ("state.json", b'{"began": "yesterday"}'),
+        ("state.json", b'{"began": NaN}'),
+        ("state.json", b'{"error": 3}'),
+        ("state.json", b'{"seconds": [1]}'),
+        ("state.json", b'{"attempt": true}'),
         ("population/manifest.json", b'{"members": 3}'),
         ("ledger.jsonl", b"{}\n"),
         ("ledger.jsonl", b'{"kind": "SP", "steps": "x"}\n'),
+        ("ledger.jsonl", b'{"kind": "SP", "steps": Infinity}\n'),
     ],
 )
 def test_a_damaged_run_is_named_and_hides_no_other(folder: Path, name: str, content: bytes) -> None:
@@ -169,6 +176,27 @@ def test_a_damaged_run_is_named_and_hides_no_other(folder: Path, name: str, cont
     assert found["first"]["state"] == "damaged" and name in found["first"]["error"]
     assert "\n" not in found["first"]["error"] and len(found["first"]["error"]) < 200
     assert found["second"]["state"] == "interrupted" and found["second"]["steps"] == {}
+
+
+@pytest.mark.parametrize("name", ["state.json", "population/manifest.json", "ledger.jsonl"])
+def test_a_device_in_a_files_place_is_not_read(folder: Path, name: str) -> None:
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to("/dev/zero")
+    told = describe_run(folder)
+    assert told["state"] == "damaged" and told["error"] == f"{name} cannot be read (is no regular file)"
+
+
+def test_what_others_wrote_does_not_reach_the_terminal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Control characters, and text that is no Unicode."""
+    (folder / "state.json").write_text(json.dumps({"state": "failed", "error": "\x1b]0;x\x07\ud800 é"}))
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"method": "\x1b[2J"}))
+    odd = folder.with_name(os.fsdecode(b"od\xffd\n"))
+    folder.rename(odd)
+    told = describe_run(odd)
+    assert (told["id"], told["method"], told["error"]) == ("od?d?", "?[2J", "?]0;x?? é")
+    assert cli.main(["runs", str(odd.parent)]) == 0
+    assert "\x1b" not in capsys.readouterr().out
 
 
 def test_a_line_that_is_being_written_does_not_count(folder: Path) -> None:

@@ -71,11 +71,14 @@ def test_the_log_is_one_object_a_line(tmp_path: Path) -> None:
     reporter.phase("member 1: self-play", 10)
     reporter.update(3, steps=4)
     reporter.note("two\nlines")
-    log.write("checkpoint", member=1, iteration=7)
+    log.place = {"member": 1, "iteration": 7}
+    log.write("checkpoint", steps=30)
+    log.write("member", member=2)
     rows = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
-    assert [row["event"] for row in rows] == ["note", "note", "checkpoint"]
+    assert [row["event"] for row in rows] == ["note", "note", "checkpoint", "member"]
     assert all(row["run"] == "r" and row["attempt"] == 2 and row["level"] == "INFO" and row["time"] for row in rows)
-    assert rows[1]["text"] == "two\nlines" and (rows[2]["member"], rows[2]["iteration"]) == (1, 7)
+    assert rows[1]["text"] == "two\nlines" and "member" not in rows[1]
+    assert [(row["member"], row["iteration"]) for row in rows[2:]] == [(1, 7), (2, 7)] and rows[2]["steps"] == 30
 
 
 def test_a_log_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:

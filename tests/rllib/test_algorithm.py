@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
+from ray.train.constants import DEFAULT_STORAGE_PATH
 
 from popgen.config import ClusterConfig, DiversityConfig, EnvConfig, PpoConfig
 from popgen.envs import make_env
@@ -126,6 +128,25 @@ def test_fresh_episodes_choose_the_strongest_partner(comedi: Mappo, monkeypatch:
     assert met == {strongest}
 
 
+def test_all_fresh_episodes_decide_however_many(comedi: Mappo) -> None:
+    assert CROSS.window == 32
+    for _ in range(40):
+        comedi.partners[3].add(1, 1.0, 0.0)
+    assert len(comedi.partners[3].returns[1]) >= 40
+
+
+def test_a_runner_without_a_share_of_the_fresh_episodes_is_left_out(
+    comedi: Mappo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rollouts = seen(comedi, monkeypatch)
+    counted: list[module.Counted] = []
+    weights = comedi.actors()
+    ask = comedi._ask
+    monkeypatch.setattr(comedi, "_ask", lambda what, request: [(1, None), *ask(what, request)])
+    comedi._select(weights, counted)
+    assert [c.steps for c in counted] == [rollouts[0][1].steps] and rollouts[0][0] == "episodes"
+
+
 def test_lambda_rises_and_stays(comedi: Mappo) -> None:
     found = []
     for comedi.rounds in range(6):
@@ -145,6 +166,11 @@ def test_all_members_meet_all_others(solo: Mappo) -> None:
         for member, known in algorithm.partners.items():
             assert set(known.returns) == {1, 2, 3} - {member} and all(known.returns.values())
         assert list(algorithm.partners[1].returns[2]) == list(algorithm.partners[2].returns[1])
+        for strongest in (2, 3):  # the only one that member 1 is trained against, while all are sampled
+            algorithm.partners[1].add(strongest, 1e6 * strongest, 0.0)
+            plan = algorithm._plan(1)
+            assert plan == Plan(strongest, pytest.approx(0.25 * 3 / 4))
+            assert all(algorithm._plays(group, {1: plan, 2: Plan(1), 3: Plan(1)}) for group in algorithm.groups)
     finally:
         algorithm.stop()
 
@@ -164,9 +190,9 @@ def ends(**values: Any) -> tuple[bool, ...]:
     ppo = PPO.model_copy(update={"target_score": values.get("target", 1e9)})
     algorithm = Mappo.__new__(Mappo)
     algorithm.job = Job(ENV, ppo, diversity, (3,), seed=0, frozen={1: {}, 2: {}})
-    algorithm.rounds = values.get("rounds", 1)
+    algorithm.taken = {3: values.get("taken", 40)}
     algorithm.own = {3: values.get("own", [])}
-    algorithm.partners = {3: module.PartnerReturns([1, 2], 5)}
+    algorithm.partners = {3: module.PartnerEpisodes([1, 2], 5)}
     for partner, score in values.get("cross", ()):
         algorithm.partners[3].add(partner, 0.0, score)
     return algorithm.finished
@@ -174,11 +200,36 @@ def ends(**values: Any) -> tuple[bool, ...]:
 
 def test_training_ends_with_its_budget_or_its_targets() -> None:
     done = {"target": 5.0, "target_xp": 1.0, "own": [5.0] * 4, "cross": [(1, 1.0), (2, 0.5)]}
-    assert ends(rounds=10) and not ends(rounds=9)  # 10 rounds of 40 steps are the budget of 400
+    assert ends(taken=400) and not ends(taken=399)
     assert ends(**done)
     for change in ({"own": [5.0] * 3}, {"own": [4.9] * 4}, {"cross": [(1, 1.1), (2, 0.5)]}, {"cross": [(1, 1.0)]}):
         assert not ends(**(done | change))
     assert not ends(**(done | {"target_xp": 0.9})) and not ends(**(done | {"target": 5.1}))
+
+
+def test_a_training_leaves_nothing_in_the_users_home(solo: Mappo) -> None:
+    def there() -> set[str]:
+        return set(os.listdir(DEFAULT_STORAGE_PATH)) if os.path.isdir(DEFAULT_STORAGE_PATH) else set()
+
+    before = there()
+    algorithm = build(SOLO)
+    algorithm.stop()
+    assert there() == before
+
+
+def test_the_budget_is_what_came_back(solo: Mappo, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lost runner's share is not counted, and therefore sampled later."""
+    before = solo.taken[1]
+    request = solo._request
+
+    def half(what: str, counted: list[module.Counted], **given: Any) -> list[Rollout]:
+        pool = solo.env_runner_group.local_env_runner.pool
+        monkeypatch.setattr(pool, "groups", (module.Group(Kind.SP, (1, 1), 2, 1),))
+        return request(what, counted, **given)
+
+    monkeypatch.setattr(solo, "_request", half)
+    solo.train()
+    assert solo.taken[1] == before + 20 and solo.progress == pytest.approx((before + 20) / 400)
 
 
 def test_an_algorithm_goes_on_from_its_snapshot(solo: Mappo, comedi: Mappo) -> None:
@@ -214,11 +265,16 @@ def test_a_killed_runner_is_replaced_and_every_step_counted_once() -> None:
         while len(steps) < 2 or len(steps[-1]) < 2 and time.monotonic() < deadline:
             algorithm.train()  # with what there is, until Ray has started the runner again
             steps.append({c.runner: c.steps for c in algorithm.report.counted})
+            assert set(algorithm.report.lost) == {1, 2} - set(steps[-1]), "the loss is told"
         assert steps[0] in ({2: 20}, {1: 20, 2: 20}) and steps[-1] == {1: 20, 2: 20}
+        assert algorithm.taken[1] == 40 + sum(sum(one.values()) for one in steps)
         state = algorithm.snapshot()
         assert set(state["runners"]) == {"1", "2"}
         algorithm.resume(state)
         algorithm.train()
         assert sum(totals(algorithm).values()) == 40
+        state["runners"]["2"]["states"] = state["runners"]["2"]["states"][:, :-1]
+        with pytest.raises(ValueError):  # a remote runner's error is not passed over
+            algorithm.resume(state)
     finally:
         algorithm.stop()

@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves, tree_map_only
 
 from popgen.config import ClusterConfig, DiversityConfig, EnvConfig, PpoConfig
 from popgen.envs import make_env
@@ -165,3 +168,98 @@ def test_rollouts_of_several_runners_are_one_batch() -> None:
     own = np.concatenate([r.reward[:, r.columns(0)] for r in rollouts])
     assert figures["sp_reward"] == pytest.approx(float(own.mean()), abs=1e-6)
     assert {"xp_reward", "policy_loss", "value_loss", "entropy", "kl", "clipped"} <= figures.keys()
+
+
+def test_fewer_rows_than_minibatches_are_learned_from() -> None:
+    """A lost runner may have had most of them: a minibatch without rows would have no mean entropy."""
+    ppo = PPO.model_copy(update={"minibatches": 80})
+    job = Job(ENV, ppo, None, (1,), seed=3)
+    made = learner(job)
+    pool = SlotPool(lambda n, s: make_env(ENV.name, n, seed=s, **ENV.params), job.groups(), "features", seed=0)
+    short = pool.play([0], 2, actors(made))
+    before = copies(made._member(1))
+    update(made, [short], {1: Plan()})
+    assert np.isfinite(list(made.figures()[1].values())).all()
+    assert moved(made._member(1), before) == {"actor", "critics.SP"}
+
+
+CARD = torch.device("cuda", 0)
+
+
+class Card(TorchFunctionMode):
+    """Stands in for a GPU, which this machine need not have: refuses what CUDA would.
+
+    Tensors that are moved to it, and what is computed from them, are marked. One of them meets another tensor only if
+    that is a scalar or an index, and becomes an array only after `cpu()`.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        given = [t for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)]
+        on_card = [t for t in given if marked(t)]
+        if func == Tensor.device.__get__:
+            return CARD if on_card else func(*args, **kwargs)
+        if func is Tensor.to and CARD in (*args[1:], kwargs.get("device")):
+            return mark(args[0].to(kwargs.get("dtype", args[0].dtype)).clone())
+        if func is Tensor.cpu:
+            return args[0].clone()
+        assert not (on_card and func is Tensor.numpy), "an array of a tensor on the card"
+        loose = [t for t in given if not marked(t) and t.dim()]
+        allowed = func is Tensor.copy_ or func is Tensor.__getitem__ and marked(args[0])
+        assert not (on_card and loose and not allowed), f"{func.__name__} of tensors on two devices"
+        result = func(*args, **kwargs)
+        return tree_map_only(Tensor, mark, result) if on_card else result
+
+
+def mark(tensor: Tensor) -> Tensor:
+    tensor.on_card = True  # type: ignore[attr-defined]
+    return tensor
+
+
+def marked(tensor: Tensor) -> bool:
+    return getattr(tensor, "on_card", False)
+
+
+def on_card(made: PooledLearner) -> PooledLearner:
+    made._device = CARD
+    for member in made.config.job.learning:
+        tensors = [*made._member(member).parameters(), *made._member(member).buffers()]
+        for tensor in tensors:
+            mark(tensor)
+    return made
+
+
+@pytest.mark.parametrize("changes", [{}, {"xp_loss": "negated"}])
+def test_a_learner_on_a_card_learns_the_same(changes: dict[str, Any]) -> None:
+    job = later(**changes)
+    here, there = learner(job), on_card(learner(job))
+    nets, plans = with_partners(here), {3: Plan(1, 0.5, 0.25)}
+    rollouts = [sampled(job, nets, seed=1), sampled(job, nets, seed=2)]
+    update(here, rollouts, plans)
+    with Card():
+        update(there, rollouts, plans)
+        actor, critics, snapshot = there.actors()[3], there.critics(3), there.snapshot()
+        there.restore(snapshot)
+        figures = there.figures()[3]
+    assert all((actor[name] == array).all() for name, array in here.actors()[3].items())
+    assert all((critics[name] == array).all() for name, array in here.critics(3).items())
+    assert figures == here.figures()[3]
+
+
+def test_the_card_refuses_what_is_elsewhere() -> None:
+    with Card():
+        there, here = torch.ones(3).to(CARD), torch.ones(3)
+        assert (there * 2.0)[torch.tensor([0, 1])].device == CARD and here.device.type == "cpu"
+        with pytest.raises(AssertionError, match="two devices"):
+            there + here
+        with pytest.raises(AssertionError, match="an array"):
+            (there + 1.0).numpy()
+        assert (there.cpu() + here).tolist() == [2.0] * 3
+
+
+def test_a_learner_that_asks_for_a_card_gets_one() -> None:
+    job = Job(ENV, PPO, None, (1,), seed=0)
+    assert MappoConfig.of(job, SPEC, ClusterConfig()).num_gpus_per_learner == 0
+    config = MappoConfig.of(job, SPEC, ClusterConfig(agent_gpus=1.0))
+    config.validate()
+    assert config.num_gpus_per_learner == 1 and config.num_learners == 0

@@ -111,6 +111,13 @@ def test_episodes_are_whole_and_their_figures_are_sums() -> None:
     assert all(e.score == pytest.approx(e.reward) for e in rollout.episodes)  # both are the reward here
 
 
+def test_once_tells_of_the_first_episode_of_every_environment() -> None:
+    slots = pool(SP, XP, make=arena, stagger=False, once=True)
+    rollout = slots.play([0, 1], 90, actors(arena))
+    assert (rollout.terminated | rollout.truncated).sum() > 10
+    assert sorted(episode.group for episode in rollout.episodes) == [0, 0, 0, 1, 1]
+
+
 def test_mixed_play_goes_over_to_the_owner_once_in_an_episode() -> None:
     slots = pool(MP, stagger=False)
     first = slots.switch.copy()

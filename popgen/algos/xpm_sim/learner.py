@@ -329,5 +329,5 @@ class XpmSimLearner:
         self.rng.bit_generator.state = state["rng"]
         self.starts.load_state(state["starts"])
         self.simulator.load_state(state["simulator"])
-        self.updates, self.simulated, self.trajectories = state["counters"]
-        self.partner_scores = {int(k): v for k, v in state["partner_scores"].items()}
+        self.updates, self.simulated, self.trajectories = map(int, state["counters"])
+        self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}

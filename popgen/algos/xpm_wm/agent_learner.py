@@ -349,9 +349,9 @@ class AgentLearner:
         w.load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
         self.rng.bit_generator.state = state["rng"]
-        self.updates, self.playing = state["updates"], state["playing"]
-        self.partner_scores = {int(k): v for k, v in state["partner_scores"].items()}
-        self.imagined_scores = {int(k): v for k, v in state["imagined_scores"].items()}
+        self.updates, self.playing = int(state["updates"]), int(state["playing"])
+        self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
+        self.imagined_scores = {int(k): float(v) for k, v in state["imagined_scores"].items()}
 
 
 def _rows(imagined: Imagined, rows: slice) -> Imagined:

@@ -199,4 +199,4 @@ class ModelLearner:
         w.load_optimiser_state(self.optimiser, state["optimiser"])
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
         self.rng.bit_generator.state = state["rng"]
-        self.updates = state["updates"]
+        self.updates = int(state["updates"])
