@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import ray
 import torch
 
 from pipelines.books import Books
@@ -93,7 +91,7 @@ class Baseline:
     def _train(self, learning: tuple[int, ...], first: int, saved: dict[str, Any] | None) -> None:
         """Train `learning`, then add its members from `first` on."""
         job, cluster = self.job(learning), self.config.cluster
-        check_needs(job, self.spec, cluster, self.reporter.note)
+        check_needs(job, self.spec, cluster)
         algorithm = MappoConfig.of(job, self.spec, cluster).build_algo()
         try:
             began = time.time()
@@ -233,15 +231,14 @@ class CoMeDi(Baseline):
 # ---- what a training needs -------------------------------------------------------------------------------------------
 
 
-def check_needs(job: Job, spec: EnvSpec, cluster: ClusterConfig, tell: Callable[[str], None]) -> None:
-    """Memory, the card and the room for runners that a training asks for; `tell` hears of waiting for nodes.
+def check_needs(job: Job, spec: EnvSpec, cluster: ClusterConfig) -> None:
+    """Memory and the card that a training asks for.
 
     Raises:
         UserError: one of them is missing.
     """
     check_memory(job, spec)
     check_card(cluster)
-    wait_for_runners(job.ppo.runners, cluster, tell)
 
 
 def check_memory(job: Job, spec: EnvSpec) -> None:
@@ -273,30 +270,3 @@ def check_card(cluster: ClusterConfig) -> None:
     if cluster.agent_gpus > 0.0 and not torch.cuda.is_available():
         problem = f"{cluster.agent_gpus:g}, but the driver, in whose process the baselines learn, sees no GPU"
         raise UserError("cluster.agent_gpus", problem, "set it to 0, or start the driver where there is one")
-
-
-def wait_for_runners(runners: int, cluster: ClusterConfig, tell: Callable[[str], None]) -> None:
-    """Until every remote runner finds room on a node: without it, it would wait for ever.
-
-    Raises:
-        UserError: a local Ray has no room, or a cluster has none within `cluster.wait_seconds`.
-    """
-    needed = {name: amount for name, amount in {"CPU": cluster.sampler_cpus, **cluster.resources}.items() if amount}
-    began, told = time.monotonic(), False
-    while (room := places(needed, [node["Resources"] for node in ray.nodes() if node["Alive"]], runners)) < runners:
-        each = " and ".join(f"{amount:g} {name}" for name, amount in needed.items())
-        problem = f"{runners} that take {each} each, Ray has room for {room}"
-        if cluster.address is None or time.monotonic() - began >= cluster.wait_seconds:
-            raise UserError("ppo.runners", problem, "lower it, or what each takes (cluster.sampler_cpus, resources)")
-        if not told:
-            tell(f"waiting for nodes: {problem}")
-        told = True
-        time.sleep(1.0)
-
-
-def places(needed: Mapping[str, float], nodes: Sequence[Mapping[str, float]], most: int) -> int:
-    """How many processes, `most` at most, that take `needed` each find room on nodes of these resources."""
-    if not needed:
-        return most
-    room = (min(math.floor(node.get(name, 0.0) / amount + 1e-9) for name, amount in needed.items()) for node in nodes)
-    return min(most, sum(room))

@@ -33,9 +33,9 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
     settle(config.cluster.threads)
     spec = build_env(config.env, 1).spec
     job = Job(config.env, config.ppo, None, (1,), seed=config.run.seed)
-    mine = start_ray(config.cluster)
+    mine = start_ray(config)
     try:
-        check_needs(job, spec, config.cluster, lambda text: None)
+        check_needs(job, spec, config.cluster)
         algorithm = MappoConfig.of(job, spec, config.cluster).build_algo()
         try:
             measured = _train(algorithm, seconds)

@@ -125,7 +125,7 @@ def bench_scale(
     settle(config.cluster.threads)
     rows, costs, overlap = [], None, config.run.overlap
     cores = float(len(os.sched_getaffinity(0)))
-    mine = start_ray(config.cluster)
+    mine = start_ray(config)
     try:
         for count in samplers:
             tell(f"{count} samplers of {config.phase1.envs} environments for {seconds:g} s")

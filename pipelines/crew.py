@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,27 +15,29 @@ from actors.model_learner import ModelActor
 from actors.replay import ReplayActor
 from actors.sampler import SamplerActor
 from pipelines.play import Players
-from popgen.config import ClusterConfig, RunConfig
+from popgen.config import RunConfig
+from popgen.demands import demands, total
 from popgen.errors import UserError
 
 STARTS = 4
 LATE = "timed out during startup"
 
 
-def start_ray(cluster: ClusterConfig) -> bool:
+def start_ray(config: RunConfig) -> bool:
     """Connect to a cluster or start a local one; True if this call did it."""
     if ray.is_initialized():
         return False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # Quiet: Ray warns once about the accelerator variable it will stop overriding.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    cluster, asked = config.cluster, total(demands(config)).get("CPU", 0.0)
     local = cluster.address is None
     limits = {"object_store_memory": cluster.object_store_bytes} if local and cluster.object_store_bytes else {}
     arguments = {
         # Without an address Ray would look for a running cluster before it starts a local one.
         "address": "local" if local else cluster.address,
         # On fewer cores than the actors ask for they take turns.
-        "num_cpus": cluster.num_cpus or max(os.cpu_count() or 1, math.ceil(cluster.cpus)) if local else None,
+        "num_cpus": cluster.num_cpus or max(os.cpu_count() or 1, math.ceil(asked)) if local else None,
         "include_dashboard": False if local else None,
         "log_to_driver": False,
         "logging_level": "ERROR",
@@ -64,40 +65,6 @@ def _init(arguments: dict[str, Any]) -> None:
         ray.shutdown()
     problem = f"Ray did not come up in {STARTS} tries, the machine is too busy"
     raise UserError("cluster", problem, "end other work; the same run.id goes on")
-
-
-def check_resources(cluster: ClusterConfig, have: Mapping[str, float]) -> None:
-    """The actors must find room, or they wait for ever.
-
-    Raises:
-        UserError: the whole cluster has less than all of them ask for.
-    """
-    actors = cluster.samplers + 4
-    needed = {"CPU": cluster.cpus, "GPU": cluster.model_gpus + cluster.agent_gpus}
-    needed |= {name: actors * amount for name, amount in cluster.resources.items()}
-    for name, amount in needed.items():
-        if amount > have.get(name, 0.0):
-            problem = f"the actors ask for {amount:g} {name}, the cluster has {have.get(name, 0.0):g}"
-            raise UserError("cluster", problem, "ask for less, or wait until its nodes are up")
-
-
-def check_nodes(cluster: ClusterConfig, nodes: Sequence[Mapping[str, float]]) -> None:
-    """Each actor must fit on one of the nodes, whose resources are given by name.
-
-    Raises:
-        UserError: one of them fits on none.
-    """
-    wanted = {
-        "sampler_cpus": {"CPU": cluster.sampler_cpus},
-        "replay_cpus": {"CPU": cluster.replay_cpus},
-        "model_cpus": {"CPU": cluster.model_cpus, "GPU": cluster.model_gpus},
-        "agent_cpus": {"CPU": cluster.agent_cpus, "GPU": cluster.agent_gpus},
-    }
-    for field, needed in wanted.items():
-        needed = {name: amount for name, amount in {**needed, **cluster.resources}.items() if amount}
-        if not any(all(amount <= node.get(name, 0.0) for name, amount in needed.items()) for node in nodes):
-            told = " and ".join(f"{amount:g} {name}" for name, amount in needed.items())
-            raise UserError(f"cluster.{field}", f"no node has {told}", "ask for less, or wait until its nodes are up")
 
 
 @dataclass

@@ -136,10 +136,9 @@ class _Job:
 
     def _start_ray(self) -> None:
         """Connect to a cluster and wait for its nodes, or start a local Ray, unless there is one."""
-        cluster = self.config.cluster
-        self.mine = start_ray(cluster)
-        if self.mine and cluster.address is not None:
-            wait_for_room(cluster, self.reporter.note)
+        self.mine = start_ray(self.config)
+        if self.mine and self.config.cluster.address is not None:
+            wait_for_room(self.config, self.reporter.note)
 
     def _attempt(self) -> dict[str, Any]:
         books = self.books
@@ -162,7 +161,7 @@ class _Job:
             tracker.forget()
             ray.shutdown()
             self._start_ray()
-        wait_for_room(self.config.cluster, self.reporter.note)
+        wait_for_room(self.config, self.reporter.note)
         self.books = Books(self.config, self.spec, tracker)
         gauge("popgen_restarts", self.books.attempt - 1, run=self.books.run_id)
 

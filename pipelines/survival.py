@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 import ray
 from ray import exceptions
 
-from pipelines.crew import check_nodes, check_resources
-from popgen.config import ClusterConfig
+from popgen.config import RunConfig
+from popgen.demands import check_room, demands
 from popgen.errors import UserError
 
 DEATHS = (
@@ -97,21 +97,18 @@ def first_line(error: BaseException) -> str:
     return f"{type(error).__name__}{whom}: {text.partition(chr(10))[0]}"[:300]
 
 
-def wait_for_room(
-    cluster: ClusterConfig, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic
-) -> None:
-    """Until the cluster has what the actors ask for: after a node died, another one may be on its way.
+def wait_for_room(config: RunConfig, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+    """Until there is room for the actors: after a node of a cluster died, another one may be on its way.
 
     Raises:
-        UserError: it has not within `cluster.wait_seconds`.
+        UserError: there is none within `cluster.wait_seconds`.
     """
-    began, pause = clock(), 0.1
+    began, pause, wanted = clock(), 0.1, demands(config)
     while True:
         try:
-            check_resources(cluster, ray.cluster_resources())
-            return check_nodes(cluster, [node["Resources"] for node in ray.nodes() if node["Alive"]])
+            return check_room(wanted, [node["Resources"] for node in ray.nodes() if node["Alive"]])
         except UserError as error:
-            if clock() - began >= cluster.wait_seconds:
+            if clock() - began >= config.cluster.wait_seconds:
                 raise
             if pause == 0.1:
                 tell(f"waiting for nodes: {error.problem}")

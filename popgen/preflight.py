@@ -10,8 +10,9 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from popgen.config import OPEN_LOOP, SHAPES, ClusterConfig, RunConfig
+from popgen.config import OPEN_LOOP, SHAPES, RunConfig
 from popgen.data import sizes
+from popgen.demands import demands, total
 from popgen.envs.base import EnvSpec
 from popgen.envs.registry import make_env
 from popgen.errors import UserError
@@ -42,11 +43,11 @@ def preflight(config: RunConfig) -> None:
     """
     spec = _build(config)
     check_run_id(config.run.id)
+    check_cluster(config)
     if config.method == "xpm_wm":
         _check_view(config, spec)
         _check_rewards(config, spec)
         _check_lengths(config, spec)
-        check_cluster(config.cluster)
     if "ppo" in config.relevant():
         check_baseline(config, spec)
     if config.method == "xpm_sim":
@@ -66,15 +67,12 @@ def preflight(config: RunConfig) -> None:
 
 
 def check_baseline(config: RunConfig, spec: EnvSpec) -> None:
-    """What RLlib's MAPPO needs: the view, CoMeDi's order, and a core's share for each remote runner."""
-    ppo, cluster = config.ppo, config.cluster
+    """What RLlib's MAPPO needs: the view and CoMeDi's order."""
+    ppo = config.ppo
     if ppo.view not in spec.views:
         raise UserError("ppo.view", f"{spec.name} has no view {ppo.view!r}", f"choose one of {', '.join(spec.views)}")
     if config.method == "comedi" and config.diversity.order != "sequential":
         raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")
-    needed, have = ppo.runners * cluster.sampler_cpus, cluster.num_cpus
-    if cluster.address is None and have is not None and have < needed:
-        raise UserError("cluster.num_cpus", f"{have}, but the runners ask for {needed:g}", "raise it or ask for less")
 
 
 def check_evaluation(config: RunConfig) -> None:
@@ -150,20 +148,22 @@ def check_store(config: RunConfig, spec: EnvSpec) -> None:
         raise UserError("cluster.object_store_bytes", problem, f"set it, or lower {_CAPACITY[config.method]}")
 
 
-def check_cluster(cluster: ClusterConfig) -> None:
+def check_cluster(config: RunConfig) -> None:
     """A local Ray must have what the actors ask for, or they wait for ever; a running cluster is asked itself later."""
+    cluster = config.cluster
     if cluster.address is not None:
         return
-    needed, have = cluster.cpus, cluster.num_cpus
-    if have is not None and have < needed:
-        raise UserError("cluster.num_cpus", f"{have}, but the actors ask for {needed:g}", "raise it or ask for less")
-    gpus, found = cluster.model_gpus + cluster.agent_gpus, len(list(Path("/dev").glob("nvidia[0-9]*")))
+    needed = total(demands(config))
+    cpus, have = needed.pop("CPU", 0.0), cluster.num_cpus
+    if have is not None and have < cpus:
+        raise UserError("cluster.num_cpus", f"{have}, but the actors ask for {cpus:g}", "raise it or ask for less")
+    gpus, found = needed.pop("GPU", 0.0), len(list(Path("/dev").glob("nvidia[0-9]*")))
     if gpus > found:
         problem = f"the learners ask for {gpus:g} GPUs, this machine has {found}"
         raise UserError("cluster.model_gpus", problem, "set cluster.model_gpus and cluster.agent_gpus to 0")
-    if asked := [name for name, amount in cluster.resources.items() if amount]:
+    if needed:
         problem = "is a resource that a local Ray does not have"
-        raise UserError(f"cluster.resources.{asked[0]}", problem, "leave it out or give cluster.address")
+        raise UserError(f"cluster.resources.{min(needed)}", problem, "leave it out or give cluster.address")
 
 
 def check_root(root: Path, needed: int, field: str = "run.root") -> None:

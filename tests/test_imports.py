@@ -16,7 +16,7 @@ ORDER = (
     *("tracking", "world_model", "policies", "data"),
     "population",
     *("algos", "rllib", "evaluation"),
-    "preflight",
+    *("demands", "preflight"),
     "actors",
     "pipelines",
     *("conf", "cli", "__main__"),

@@ -56,7 +56,7 @@ def in_this_process() -> Iterator[None]:
         patch.setattr(ray, "get", lambda given, **_: given)
         patch.setattr(ray, "put", lambda value: value)
         patch.setattr(ray, "wait", lambda references, **_: (references, []))
-        patch.setattr(main_job, "start_ray", lambda cluster: False)
+        patch.setattr(main_job, "start_ray", lambda config: False)
         patch.setattr(xpm_wm, "Crew", LocalCrew)
         yield
 

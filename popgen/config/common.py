@@ -60,11 +60,6 @@ class ClusterConfig(Schema):
     wait_seconds: Weight = 600.0
     object_store_bytes: Annotated[_Int, Field(ge=80 * 2**20, le=2**50)] | None = None
 
-    @property
-    def cpus(self) -> float:
-        """What all actors together ask for."""
-        return self.samplers * self.sampler_cpus + 2 * self.replay_cpus + self.model_cpus + self.agent_cpus
-
 
 class TrackingConfig(Schema):
     """MLflow; without a URI a sqlite store in the run's folder.

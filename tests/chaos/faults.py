@@ -264,7 +264,7 @@ FAULTS = {
         Fault("local control store", kill_local("gcs_server")),
         Fault("disk full", fill_disk(0), is_root, one_line=True),
         Fault("disk nearly full", fill_disk(64 * 2**20), is_root, one_line=True),
-        Fault("damaged checkpoint", damage_checkpoint, lambda method: method.startswith("xpm")),
+        Fault("damaged checkpoint", damage_checkpoint),
         Fault("machine lost", lose_machine),
     )
 }

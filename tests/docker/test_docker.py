@@ -280,6 +280,7 @@ def test_the_pods_of_the_rayjob_share_the_runs_and_are_no_root() -> None:
 
 def test_the_entrypoint_of_the_rayjob_is_a_run_that_its_cluster_can_hold() -> None:
     from popgen.config import RunConfig
+    from popgen.demands import check_room, demands
 
     _, job = rayjob()
     program, command, *overrides = shlex.split(job["spec"]["entrypoint"])
@@ -290,7 +291,7 @@ def test_the_entrypoint_of_the_rayjob_is_a_run_that_its_cluster_can_hold() -> No
     (workers,) = cluster["workerGroupSpecs"]
     pods = [cluster["headGroupSpec"]] + [workers] * workers["replicas"]
     cpus = [int(pod["template"]["spec"]["containers"][0]["resources"]["limits"]["cpu"]) for pod in pods]
-    assert config.cluster.cpus <= sum(cpus) and max(config.cluster.model_cpus, config.cluster.agent_cpus) <= max(cpus)
+    check_room(demands(config), [{"CPU": float(count)} for count in cpus])
 
 
 # --- the entry script

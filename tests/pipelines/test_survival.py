@@ -12,7 +12,8 @@ from ray import exceptions
 from pipelines import population as main_job
 from pipelines import survival
 from pipelines.survival import Patience, death, told, wait_for_room
-from popgen.config import ClusterConfig
+from popgen.cli.compose import compose
+from popgen.config import RunConfig
 from popgen.errors import UserError
 
 
@@ -85,23 +86,26 @@ def test_patience_ends_with_deaths_in_a_row_at_the_same_place() -> None:
 
 
 def test_nodes_are_waited_for_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = RunConfig.parse(compose(["scale=smoke", "cluster.wait_seconds=60"]))
     have, said, now = [{"CPU": 1.0}, {"CPU": 1.0}, {"CPU": 8.0}], [], [0.0]
-    monkeypatch.setattr(survival.ray, "cluster_resources", lambda: have.pop(0) if len(have) > 1 else have[0])
-    monkeypatch.setattr(survival.ray, "nodes", lambda: [{"Alive": True, "Resources": {"CPU": 8.0}}])
+    dead = {"Alive": False, "Resources": {"CPU": 8.0}}
+
+    def nodes() -> list[dict[str, Any]]:
+        return [dead, {"Alive": True, "Resources": have.pop(0) if len(have) > 1 else have[0]}]
+
+    monkeypatch.setattr(survival.ray, "nodes", nodes)
     monkeypatch.setattr(survival.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
-    wait_for_room(ClusterConfig(wait_seconds=60), said.append, clock=lambda: now[-1])
+    wait_for_room(config, said.append, clock=lambda: now[-1])
     assert said == ["waiting for nodes: the actors ask for 1.9 CPU, the cluster has 1"] and len(now) == 3
     have[:] = [{"CPU": 1.0}]
     with pytest.raises(UserError, match="the actors ask for 1.9 CPU"):
-        wait_for_room(ClusterConfig(wait_seconds=60), said.append, clock=lambda: now[-1])
+        wait_for_room(config, said.append, clock=lambda: now[-1])
     assert now[-1] >= 60
 
 
 def run_with(monkeypatch: pytest.MonkeyPatch, root: Path, attempts: list[Callable[[Any], None]], **cluster: Any) -> Any:
     """The main job with a driver that does, attempt by attempt, what it is given."""
     from pipelines.population import run_population
-    from popgen.cli.compose import compose
-    from popgen.config import RunConfig
     from popgen.progress import NullReporter
 
     class Driver:
@@ -112,8 +116,8 @@ def run_with(monkeypatch: pytest.MonkeyPatch, root: Path, attempts: list[Callabl
             attempts.pop(0)(self.books)
 
     monkeypatch.setattr(main_job, "driver_class", lambda method: Driver)
-    monkeypatch.setattr(main_job, "start_ray", lambda cluster: False)
-    monkeypatch.setattr(main_job, "wait_for_room", lambda cluster, tell: None)
+    monkeypatch.setattr(main_job, "start_ray", lambda config: False)
+    monkeypatch.setattr(main_job, "wait_for_room", lambda config, tell: None)
     monkeypatch.setattr(main_job, "finish", lambda config, spec, books, reporter: {"run_dir": str(books.dir)})
     overrides = ["scale=smoke", "tracking=off", f"run.root={root}", "run.id=r"]
     config = RunConfig.parse(compose([*overrides, *(f"cluster.{name}={value}" for name, value in cluster.items())]))
