@@ -120,7 +120,7 @@ class Baseline:
         Raises:
             FloatingPointError: a figure is not finite: the networks will not recover.
         """
-        report = algorithm.report
+        report, ppo = algorithm.report, self.config.ppo
         self._count(report)
         for runner in report.lost:
             self.reporter.note(f"runner {runner} was lost: its environments are missing until Ray has restarted it")
@@ -128,6 +128,7 @@ class Baseline:
             figures = report.figures[member]
             steps = sum(self.books.training_steps(member).values())
             shown = {f"real_{k}" if k in SCORES else f"ppo/{k}": v for k, v in figures.items()}
+            shown["ppo/update_ms"] = 1000.0 * report.seconds["learning"] / (ppo.epochs * ppo.minibatches)
             self.books.log(member, steps, **shown, iteration=algorithm.rounds)
             for name, value in figures.items():
                 if not math.isfinite(value):

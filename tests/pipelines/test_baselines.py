@@ -204,7 +204,7 @@ def test_members_differ(runs: dict[str, Run]) -> None:
 def test_metrics_tell_what_training_did(runs: dict[str, Run]) -> None:
     rows = [json.loads(line) for line in (runs["comedi"].dir / "metrics.jsonl").open()]
     last = [row for row in rows if row["member"] == 3]
-    wanted = {"ppo/entropy", "ppo/xp_reward", "ppo/mp_reward", "ppo/kl", "real_xp"}
+    wanted = {"ppo/entropy", "ppo/xp_reward", "ppo/mp_reward", "ppo/kl", "ppo/update_ms", "real_xp"}
     assert len(last) == 3 and wanted <= set().union(*last)
     assert last[-1]["step"] == sum(steps for (m, _), steps in runs["comedi"].said.items() if m == 3)
 
