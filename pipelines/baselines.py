@@ -203,12 +203,7 @@ class Baseline:
             self.reporter.note(self.checkpoints.note)
         done = finished_member(self.books.dir, present) if present else {}
         self.sequence = int(done.get("sequence", 0))
-        held, wanted = len(self.books.ledger), (saved or done).get("ledger", 0)
-        if wanted > held:
-            problem = f"has {held} entries, the checkpoint knows {wanted}"
-            raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
-        if lost := self.books.ledger.cut(wanted):
-            self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
+        self.books.rewind((saved or done).get("ledger", 0), self.reporter.note)
         return present + 1, saved
 
 

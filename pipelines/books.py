@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -169,6 +169,18 @@ class Books:
         """This member's environment steps by kind, evaluation aside."""
         kinds = (Kind.RANDOM, Kind.SP, Kind.XP, Kind.MP)
         return {str(kind): steps for kind in kinds if (steps := self.ledger.steps(member=member, kind=kind))}
+
+    def rewind(self, entries: int, tell: Callable[[str], None]) -> None:
+        """Work that no checkpoint holds will be done again: its steps leave the ledger, of which `entries` stay.
+
+        Raises:
+            UserError: the ledger has fewer.
+        """
+        if entries > (held := len(self.ledger)):
+            problem = f"has {held} entries, the checkpoint knows {entries}"
+            raise UserError(str(self.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
+        if lost := self.ledger.cut(entries):
+            tell(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
 
     def log(self, member: int, step: int, **figures: float) -> None:
         """One point of all given metrics, in metrics.jsonl and MLflow."""

@@ -23,7 +23,6 @@ from popgen.data.checkpoint import save_state
 from popgen.data.sampler import Episode, Team
 from popgen.envs.base import EnvSpec
 from popgen.envs.reward import rewards_events
-from popgen.errors import UserError
 from popgen.nets.weights import Weights, prefixed
 from popgen.population import load_population
 from popgen.progress import Reporter
@@ -116,14 +115,9 @@ class XpmSim:
         saved = self.checkpoints.load(known + 1)
         last = finished_member(self.books.dir, known) if known else {}
         self.encoder = last.get("encoder")
-        held, wanted = len(self.books.ledger), (saved or last).get("ledger", 0)
-        if wanted > held:
-            problem = f"has {held} entries, the checkpoint knows {wanted}"
-            raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
         if self.checkpoints.note:
             self.reporter.note(self.checkpoints.note)
-        if lost := self.books.ledger.cut(wanted):
-            self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
+        self.books.rewind((saved or last).get("ledger", 0), self.reporter.note)
         if known:
             population = load_population(self.books.dir / "population")
             self.members = {member: population[member].weights() for member in range(1, known + 1)}

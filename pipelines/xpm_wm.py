@@ -20,7 +20,6 @@ from popgen.config import RunConfig
 from popgen.data.checkpoint import save_state
 from popgen.data.sampler import Episode
 from popgen.envs.base import EnvSpec
-from popgen.errors import UserError
 from popgen.nets.weights import Weights
 from popgen.policies.world_model_policy import WorldModelPolicy
 from popgen.population import load_population
@@ -194,11 +193,12 @@ class XpmWm:
         if self.checkpoints.note:
             self.reporter.note(self.checkpoints.note)
         if not known:
-            self._forget(saved["ledger"] if saved else 0)
+            self.books.rewind(saved["ledger"] if saved else 0, self.reporter.note)
             return 0, None, saved
         folder = member_folder(root, known)
         state = finished_member(root, known)
-        self._forget(saved["ledger"] if saved else state.get("ledger") if root == self.books.dir else 0)
+        own = state if root == self.books.dir else {}
+        self.books.rewind((saved or own).get("ledger", 0), self.reporter.note)
         if saved is None:
             with fitting(folder):
                 ray.get([getattr(self.crew, name).load_state.remote(state[name]) for name in (*REPLAYS, "model")])
@@ -212,12 +212,3 @@ class XpmWm:
             if member > present:
                 self.books.adopt(source[member], source.info(member), source.training(member))
         self.reporter.note(f"going on after member {known} of {root}")
-
-    def _forget(self, entries: int | None) -> None:
-        """Work that no checkpoint holds will be done again: its steps leave the ledger (None: unknown, all stay)."""
-        held = len(self.books.ledger)
-        if entries is not None and entries > held:
-            problem = f"has {held} entries, the checkpoint knows {entries}"
-            raise UserError(str(self.books.dir / "ledger.jsonl"), problem, "restore it from a copy, or start a new run")
-        if entries is not None and (lost := self.books.ledger.cut(entries)):
-            self.reporter.note(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")

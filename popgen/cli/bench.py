@@ -102,7 +102,7 @@ def _checked(overrides: list[str]) -> RunConfig:
 
     config = RunConfig.parse(compose(overrides))
     preflight(config)
-    before_ray(config.cluster.threads)
+    before_ray(config.cluster.threads, config.cluster.address is None)
     return config
 
 

@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     preflight(config)
     if args.dry_run:
         return _print_config(config.relevant(), args.json)
-    before_ray(config.cluster.threads)
+    before_ray(config.cluster.threads, config.cluster.address is None)
     from pipelines.population import run_population
 
     with closing(make_reporter(quiet=args.quiet)) as reporter:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import secrets
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,9 +21,15 @@ def bound_threads(count: int) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", str(count))
 
 
-def before_ray(threads: int) -> None:
-    """Before Ray is imported: it sends nothing home, and threads are bounded."""
+def before_ray(threads: int, local: bool) -> None:
+    """Before Ray is imported: it sends nothing home, threads are bounded, and a local Ray takes no orders from others.
+
+    A local Ray listens on all of the machine's addresses; it gets a token that only its own processes know. With a
+    running cluster, or RAY_AUTH_MODE set, the environment decides.
+    """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if local and "RAY_AUTH_MODE" not in os.environ and "ray" not in sys.modules:
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     bound_threads(threads)
 
 
@@ -37,7 +45,8 @@ def runs_to_start(overrides: Sequence[Sequence[str]], out: str) -> list[RunConfi
     from popgen.preflight import check_root, preflight
 
     configs = [RunConfig.parse(compose(words)) for words in overrides]
-    before_ray(max((config.cluster.threads for config in configs), default=1))
+    local = all(config.cluster.address is None for config in configs)
+    before_ray(max((config.cluster.threads for config in configs), default=1), local)
     from pipelines.batch import check_different, named
 
     configs = [named(config, Path(out) / "runs") for config in configs]
