@@ -15,8 +15,10 @@ import torch
 
 from pipelines.books import Books
 from pipelines.checkpoints import Checkpoints, finished_member, fitting, member_folder
+from pipelines.crew import alive_nodes
 from popgen.config import ClusterConfig, RunConfig
 from popgen.data.checkpoint import save_state
+from popgen.demands import check_room, demands
 from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
 from popgen.nets.weights import Weights
@@ -91,7 +93,7 @@ class Baseline:
     def _train(self, learning: tuple[int, ...], first: int, saved: dict[str, Any] | None) -> None:
         """Train `learning`, then add its members from `first` on."""
         job, cluster = self.job(learning), self.config.cluster
-        check_needs(job, self.spec, cluster)
+        check_needs(job, self.spec, self.config)
         algorithm = MappoConfig.of(job, self.spec, cluster).build_algo()
         try:
             began = time.time()
@@ -227,14 +229,15 @@ class CoMeDi(Baseline):
 # ---- what a training needs -------------------------------------------------------------------------------------------
 
 
-def check_needs(job: Job, spec: EnvSpec, cluster: ClusterConfig) -> None:
-    """Memory and the card that a training asks for.
+def check_needs(job: Job, spec: EnvSpec, config: RunConfig) -> None:
+    """Memory, the card, and room for the runners: RLlib would wait for it for ever.
 
     Raises:
         UserError: one of them is missing.
     """
     check_memory(job, spec)
-    check_card(cluster)
+    check_card(config.cluster)
+    check_room(demands(config), alive_nodes())
 
 
 def check_memory(job: Job, spec: EnvSpec) -> None:

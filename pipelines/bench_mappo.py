@@ -35,7 +35,7 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
     job = Job(config.env, config.ppo, None, (1,), seed=config.run.seed)
     mine = start_ray(config)
     try:
-        check_needs(job, spec, config.cluster)
+        check_needs(job, spec, config)
         algorithm = MappoConfig.of(job, spec, config.cluster).build_algo()
         try:
             measured = _train(algorithm, seconds)

@@ -22,7 +22,7 @@ from pipelines import baselines, checkpoints
 from pipelines.books import Books
 from pipelines.population import driver_class, run_population
 from popgen.cli.compose import compose
-from popgen.config import ClusterConfig, RunConfig
+from popgen.config import RunConfig
 from popgen.data.ledger import Ledger
 from popgen.envs import make_env
 from popgen.errors import UserError
@@ -372,11 +372,12 @@ def test_a_checkpoint_of_other_sizes_is_refused(root: Path) -> None:
 
 def needs(*overrides: str, **cluster: Any) -> UserError:
     """What is refused before the runners of CoMeDi's third member start."""
-    config = RunConfig.parse(compose(["method=comedi", "scale=smoke", *overrides]))
+    given = (f"cluster.{name}={value}" for name, value in cluster.items())
+    config = RunConfig.parse(compose(["method=comedi", "scale=smoke", *overrides, *given]))
     spec = make_env(config.env.name, 1, **config.env.params).spec
     job = Job(config.env, config.ppo, config.diversity, (3,), 0, frozen={1: {}, 2: {}}, mixed=True, fresh=True)
     with pytest.raises(UserError) as caught:
-        baselines.check_needs(job, spec, ClusterConfig(**cluster))
+        baselines.check_needs(job, spec, config)
     return caught.value
 
 
@@ -388,6 +389,8 @@ def test_what_the_machine_has_not_is_refused_before_any_runner_starts(monkeypatc
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     card = needs(agent_gpus=1.0)
     assert card.field == "cluster.agent_gpus" and "sees no GPU" in card.problem
+    room = needs("ppo.runners=3", "ppo.envs=4", sampler_cpus=1.0)
+    assert room.problem == "the actors ask for 3 CPU, the cluster has 2"
 
 
 def test_what_cannot_be_is_refused_before_anything_starts(root: Path) -> None:

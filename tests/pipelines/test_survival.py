@@ -93,7 +93,7 @@ def test_nodes_are_waited_for_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) 
     def nodes() -> list[dict[str, Any]]:
         return [dead, {"Alive": True, "Resources": have.pop(0) if len(have) > 1 else have[0]}]
 
-    monkeypatch.setattr(survival.ray, "nodes", nodes)
+    monkeypatch.setattr("ray.nodes", nodes)
     monkeypatch.setattr(survival.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
     wait_for_room(config, said.append, clock=lambda: now[-1])
     assert said == ["waiting for nodes: the actors ask for 1.9 CPU, the cluster has 1"] and len(now) == 3
