@@ -10,6 +10,7 @@ import ctypes
 import os
 import signal
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -20,6 +21,9 @@ from popgen.errors import UserError
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGCONT)
 RAY_ENDED_US = 1
 """Exit code of a process that Ray's library ended; also that of a traceback, before which a run's state is written."""
+
+LOOK = 0.1
+"""Seconds between two looks at the child."""
 
 _PARENT_DEATH = 1  # prctl's PR_SET_PDEATHSIG
 
@@ -81,8 +85,10 @@ def _wait(pid: int) -> int:
             os.kill(os.getpid(), signal.SIGSTOP)
 
     before = {number: signal.signal(number, forward) for number in FORWARDED}
-    try:
-        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    try:  # not blocked in waitpid: a signal that comes just before it would wait there with us
+        while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
+            time.sleep(LOOK)
+        return os.waitstatus_to_exitcode(ended[1])
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
