@@ -21,6 +21,7 @@ from pipelines.runs import RunState
 from popgen.cli.guard import guarded
 from popgen.errors import UserError
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 folder, retries, *ends = Path(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:]
 try:
     code = guarded(folder, retries)
