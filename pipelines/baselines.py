@@ -10,21 +10,18 @@ import math
 import time
 from typing import Any
 
-import numpy as np
 import torch
 
 from pipelines.books import Books
 from pipelines.checkpoints import Checkpoints, finished_member, fitting, member_folder
-from pipelines.crew import alive_nodes
+from pipelines.survival import wait_for_room
 from popgen.config import ClusterConfig, RunConfig
 from popgen.data.checkpoint import save_state
-from popgen.demands import check_room, demands
 from popgen.envs.base import EnvSpec
 from popgen.errors import UserError
 from popgen.nets.weights import Weights
 from popgen.policies.feed_forward import FeedForwardPolicy
 from popgen.population import load_population
-from popgen.preflight import memory_bytes
 from popgen.progress import Reporter
 from popgen.rllib.algorithm import Mappo as Algorithm
 from popgen.rllib.algorithm import MappoConfig, Report
@@ -93,7 +90,8 @@ class Baseline:
     def _train(self, learning: tuple[int, ...], first: int, saved: dict[str, Any] | None) -> None:
         """Train `learning`, then add its members from `first` on."""
         job, cluster = self.job(learning), self.config.cluster
-        check_needs(job, self.spec, self.config)
+        check_card(cluster)
+        wait_for_room(self.config, self.reporter.note)  # RLlib would wait for ever
         algorithm = MappoConfig.of(job, self.spec, cluster).build_algo()
         try:
             began = time.time()
@@ -224,40 +222,6 @@ class CoMeDi(Baseline):
 
     cross = True
     mixed = True
-
-
-# ---- what a training needs -------------------------------------------------------------------------------------------
-
-
-def check_needs(job: Job, spec: EnvSpec, config: RunConfig) -> None:
-    """Memory, the card, and room for the runners: RLlib would wait for it for ever.
-
-    Raises:
-        UserError: one of them is missing.
-    """
-    check_memory(job, spec)
-    check_card(config.cluster)
-    check_room(demands(config), alive_nodes())
-
-
-def check_memory(job: Job, spec: EnvSpec) -> None:
-    """Observations must fit the memory: an iteration's, as they were sampled and as they are learned from, and those of
-    the fresh episodes.
-
-    Raises:
-        UserError: they do not.
-    """
-    view, ppo = spec.views[job.ppo.view], job.ppo
-    steps = {"ppo.steps": 2 * (ppo.steps + 1) * sum(group.envs for group in job.groups())}
-    if job.fresh and job.diversity is not None:
-        episodes = 2 * job.diversity.select_episodes * len(job.frozen)
-        steps["diversity.select_episodes"] = (spec.horizon + 1) * episodes
-    row, have = spec.num_players * math.prod(view.shape) * np.dtype(view.dtype).itemsize, memory_bytes()
-    for field, count in steps.items():
-        if count * row > have:
-            problem = f"observations of {count:,} steps take {count * row / 2**30:,.1f} GiB of memory"
-            fix = "lower it or the number of environments"
-            raise UserError(field, f"{problem}, this machine has {have / 2**30:.1f}", fix)
 
 
 def check_card(cluster: ClusterConfig) -> None:

@@ -8,8 +8,9 @@ from typing import Any
 import ray
 
 from actors.common import build_env, settle
-from pipelines.baselines import check_needs
+from pipelines.baselines import check_card
 from pipelines.crew import start_ray
+from pipelines.survival import wait_for_room
 from popgen.config import RunConfig
 from popgen.rllib.algorithm import Mappo, MappoConfig
 from popgen.rllib.job import Job
@@ -35,7 +36,8 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
     job = Job(config.env, config.ppo, None, (1,), seed=config.run.seed)
     mine = start_ray(config)
     try:
-        check_needs(job, spec, config)
+        check_card(config.cluster)
+        wait_for_room(config, lambda text: None)
         algorithm = MappoConfig.of(job, spec, config.cluster).build_algo()
         try:
             measured = _train(algorithm, seconds)

@@ -67,11 +67,6 @@ def _init(arguments: dict[str, Any]) -> None:
     raise UserError("cluster", problem, "end other work; the same run.id goes on")
 
 
-def alive_nodes() -> list[dict[str, float]]:
-    """Resources of each node of the Ray that this process is connected to."""
-    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
-
-
 @dataclass
 class Crew:
     """Handles of one run's actors."""

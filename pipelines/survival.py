@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 import ray
 from ray import exceptions
 
-from pipelines.crew import alive_nodes
 from popgen.config import RunConfig
 from popgen.demands import check_room, demands
 from popgen.errors import UserError
@@ -107,7 +106,7 @@ def wait_for_room(config: RunConfig, tell: Callable[[str], None], clock: Callabl
     began, pause, wanted = clock(), 0.1, demands(config)
     while True:
         try:
-            return check_room(wanted, alive_nodes())
+            return check_room(wanted, [node["Resources"] for node in ray.nodes() if node["Alive"]])
         except UserError as error:
             if clock() - began >= config.cluster.wait_seconds:
                 raise

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from popgen.config import OPEN_LOOP, SHAPES, RunConfig
+from popgen.config import OPEN_LOOP, SECTIONS, SHAPES, RunConfig
 from popgen.data import sizes
 from popgen.demands import demands, total
 from popgen.envs.base import EnvSpec
@@ -48,7 +48,7 @@ def preflight(config: RunConfig) -> None:
         _check_view(config, spec)
         _check_rewards(config, spec)
         _check_lengths(config, spec)
-    if "ppo" in config.relevant():
+    if "ppo" in SECTIONS[config.method]:
         check_baseline(config, spec)
     if config.method == "xpm_sim":
         _check_simulation(config, spec)
@@ -118,8 +118,9 @@ def check_run_id(name: str | None) -> None:
 
 
 def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Buffers, object store and a batch must fit into this machine's memory; a cluster's nodes are not looked at."""
-    if config.cluster.address is not None:
+    """Buffers, object store and a batch must fit into this machine's memory; a cluster's nodes are not looked at, but
+    the baselines learn in the driver's process."""
+    if config.cluster.address is not None and "ppo" not in SECTIONS[config.method]:
         return
     needed, have = sizes.memory_needed(config, spec), memory_bytes()
     if needed <= have:

@@ -65,9 +65,26 @@ def batch_bytes(config: RunConfig, spec: EnvSpec) -> int:
     if config.method == "xpm_sim":
         columns = sim.sims_sp + sim.sims_restart + sim.sims_xp
         return columns * sim.unroll * (_state_bytes(spec) + players * _entries(spec.views.get("features")))
-    ppo = config.ppo
-    together = config.population.size if config.method == "lipo" and config.diversity.order == "concurrent" else 1
-    return together * ppo.envs * ppo.steps * players * _entries(spec.views.get(ppo.view))
+    view = spec.views.get(config.ppo.view)
+    row = 0 if view is None else players * _entries(view) * np.dtype(view.dtype).itemsize
+    # An iteration's as they were sampled and as they are learned from; or those of the fresh episodes.
+    return row * max(2 * (config.ppo.steps + 1) * _environments(config), (spec.horizon + 1) * _fresh(config))
+
+
+def _environments(config: RunConfig) -> int:
+    """Of the last member of a baseline, or of all that learn together (`popgen.rllib.job.Job.groups`)."""
+    method, ppo, diversity, size = config.method, config.ppo, config.diversity, config.population.size
+    if method == "mappo":
+        return ppo.envs
+    together = method == "lipo" and diversity.order == "concurrent"
+    own, pairs = (size, size * (size - 1) // 2) if together else (1, size - 1)
+    mixed = diversity.mp_envs if method == "comedi" and diversity.lambda_mp > 0.0 else 0
+    return own * ppo.envs + pairs * (diversity.xp_envs + mixed)
+
+
+def _fresh(config: RunConfig) -> int:
+    """Episodes by which CoMeDi's last member finds its strongest partner, played at once."""
+    return 2 * config.diversity.select_episodes * (config.population.size - 1) if config.method == "comedi" else 0
 
 
 # ---- disk ------------------------------------------------------------------------------------------------------------

@@ -93,8 +93,25 @@ def test_what_the_memory_must_hold() -> None:
     assert sizes.memory_needed(more, spec) - sizes.memory_needed(config, spec) == 4 * buffers
     large = config.model_copy(update={"cluster": config.cluster.model_copy(update={"object_store_bytes": 2**34})})
     assert 2**34 + 3 * buffers <= sizes.memory_needed(large, spec) < 2**34 + 3 * buffers + 2**28
-    wide, _ = configured("method=mappo", "ppo.envs=1000", "ppo.steps=500")
-    assert sizes.batch_bytes(wide, spec) == 1000 * 500 * 2 * spec.views["features"].shape[0]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "steps"),
+    [
+        (["method=mappo"], 2 * 51 * 100),
+        (["method=lipo"], 2 * 51 * (3 * 100 + 3 * 8)),  # all together: three pairs
+        (["method=lipo", "diversity.order=sequential"], 2 * 51 * (100 + 2 * 8)),
+        (["method=comedi"], 2 * 51 * (100 + 2 * (8 + 4))),
+        (["method=comedi", "diversity.lambda_mp=0"], 2 * 51 * (100 + 2 * 8)),
+        (["method=comedi", "diversity.select_episodes=50"], 41 * 2 * 50 * 2),  # fresh episodes with two partners
+    ],
+)
+def test_what_a_baseline_learns_from_at_once(overrides: list[str], steps: int) -> None:
+    sizes_of = ["ppo.envs=100", "ppo.steps=50", "diversity.xp_envs=8", "diversity.mp_envs=4", "population.size=3"]
+    if "select" in overrides[-1]:
+        sizes_of[:2] = ["ppo.envs=4", "ppo.steps=20"]
+    config, spec = configured(*overrides, *sizes_of, "env.params.horizon=40")
+    assert sizes.batch_bytes(config, spec) == steps * 2 * spec.views["features"].shape[0]
 
 
 def test_a_finished_run_fits(model_run: Path) -> None:

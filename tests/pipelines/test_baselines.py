@@ -22,7 +22,7 @@ from pipelines import baselines, checkpoints
 from pipelines.books import Books
 from pipelines.population import driver_class, run_population
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
+from popgen.config import ClusterConfig, RunConfig
 from popgen.data.ledger import Ledger
 from popgen.envs import make_env
 from popgen.errors import UserError
@@ -30,7 +30,6 @@ from popgen.population import Population, load_population
 from popgen.preflight import preflight
 from popgen.progress import NullReporter
 from popgen.rllib.algorithm import Mappo as Algorithm
-from popgen.rllib.job import Job
 
 HORIZON = 40
 SP_STEPS = 240
@@ -370,27 +369,18 @@ def test_a_checkpoint_of_other_sizes_is_refused(root: Path) -> None:
     shutil.rmtree(root / "other")
 
 
-def needs(*overrides: str, **cluster: Any) -> UserError:
-    """What is refused before the runners of CoMeDi's third member start."""
-    given = (f"cluster.{name}={value}" for name, value in cluster.items())
-    config = RunConfig.parse(compose(["method=comedi", "scale=smoke", *overrides, *given]))
-    spec = make_env(config.env.name, 1, **config.env.params).spec
-    job = Job(config.env, config.ppo, config.diversity, (3,), 0, frozen={1: {}, 2: {}}, mixed=True, fresh=True)
-    with pytest.raises(UserError) as caught:
-        baselines.check_needs(job, spec, config)
-    return caught.value
-
-
-def test_what_the_machine_has_not_is_refused_before_any_runner_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as small:
-        small.setattr(baselines, "memory_bytes", lambda: 2**30)
-        assert needs("ppo.envs=1000", "ppo.steps=10000").field == "ppo.steps"
-        assert needs("diversity.select_episodes=100000").field == "diversity.select_episodes"
+def test_a_card_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    card = needs(agent_gpus=1.0)
-    assert card.field == "cluster.agent_gpus" and "sees no GPU" in card.problem
-    room = needs("ppo.runners=3", "ppo.envs=4", sampler_cpus=1.0)
-    assert room.problem == "the actors ask for 3 CPU, the cluster has 2"
+    baselines.check_card(ClusterConfig())
+    with pytest.raises(UserError, match="cluster.agent_gpus: 1, but the driver.* sees no GPU"):
+        baselines.check_card(ClusterConfig(agent_gpus=1.0))
+
+
+def test_runners_that_find_no_room_are_refused(root: Path) -> None:
+    """RLlib would wait for them for ever."""
+    few = ("ppo.runners=3", "cluster.sampler_cpus=1", "cluster.wait_seconds=0")
+    with pytest.raises(UserError, match="the actors ask for 3 CPU, the cluster has 2"):
+        launch(root, "no_room", "method=mappo", *few)
 
 
 def test_what_cannot_be_is_refused_before_anything_starts(root: Path) -> None:

@@ -64,4 +64,4 @@ def test_the_command_prints_it(run: Callable[..., tuple[int, str, str]]) -> None
 def test_what_is_not_there_is_told_in_one_line() -> None:
     """A Ray of two cores is there already: runners that it has no room for would be waited for, for ever."""
     with pytest.raises(UserError, match="the actors ask for 3 CPU, the cluster has 2"):
-        bench_mappo(config("ppo.runners=3", "cluster.sampler_cpus=1"), seconds=0.1)
+        bench_mappo(config("ppo.runners=3", "cluster.sampler_cpus=1", "cluster.wait_seconds=0"), seconds=0.1)
