@@ -7,13 +7,13 @@ from typing import Any
 
 import ray
 
-from actors.common import build_env, settle
-from pipelines.baselines import check_card
-from pipelines.crew import start_ray
-from pipelines.survival import wait_for_room
-from popgen.config import RunConfig
-from popgen.rllib.algorithm import Mappo, MappoConfig
-from popgen.rllib.job import Job
+from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.config.run_config import RunConfig
+from popgen.methods.mappo.algorithm import Mappo, MappoConfig
+from popgen.methods.mappo.training_job import Job
+from popgen.pipelines.baseline_driver import check_card
+from popgen.pipelines.crew import start_ray
+from popgen.runs.recovery import wait_for_room
 
 
 def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
     Raises:
         UserError: no Ray answers, or it has not what the training needs.
     """
-    settle(config.cluster.threads)
+    limit_threads(config.cluster.threads)
     spec = build_env(config.env, 1).spec
     job = Job(config.env, config.ppo, None, (1,), seed=config.run.seed)
     mine = start_ray(config)

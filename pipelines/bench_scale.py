@@ -17,13 +17,13 @@ from typing import Any
 
 import ray
 
-from actors.common import build_env, settle
-from pipelines.books import Books
-from pipelines.crew import start_ray
-from pipelines.first_member import LEARNERS, FirstMember
-from pipelines.xpm_wm import XpmWm
-from popgen.config import RunConfig
+from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.config.run_config import RunConfig
+from popgen.pipelines.crew import start_ray
+from popgen.pipelines.first_member import LEARNERS, FirstMember
+from popgen.pipelines.xpm_wm_driver import XpmWm
 from popgen.progress import NullReporter
+from popgen.runs.recorder import RunRecorder
 
 NODES = (1, 2, 4, 8, 16, 32, 64)
 NETWORK = 1.0e9
@@ -120,9 +120,9 @@ def bench_scale(
         steps_per_second and idle_learners on as many nodes; assumptions; cores; network_bytes_per_second.
 
     Raises:
-        UserError: see `popgen.preflight`.
+        UserError: see `popgen.runs.preflight`.
     """
-    settle(config.cluster.threads)
+    limit_threads(config.cluster.threads)
     rows, costs, overlap = [], None, config.run.overlap
     cores = float(len(os.sched_getaffinity(0)))
     mine = start_ray(config)
@@ -170,16 +170,16 @@ def _measure(config: RunConfig, seconds: float) -> tuple[dict[str, Any], int]:
     root = Path(tempfile.mkdtemp(prefix="popgen-bench-"))
     config = config.model_copy(update={"run": config.run.model_copy(update={"root": str(root)})})
     spec = build_env(config.env, 1).spec
-    books = Books(config, spec)
-    driver = XpmWm(config, spec, books, NullReporter())
+    recorder = RunRecorder(config, spec)
+    driver = XpmWm(config, spec, recorder, NullReporter())
     try:
         driver.checkpoints.begin(None)
         seen = Timed(driver, config.run.seed).measure(seconds)
-        last = max((books.dir / "checkpoints").glob("segments_*"))
+        last = max((recorder.dir / "checkpoints").glob("segments_*"))
         return seen, last.stat().st_size
     finally:
         driver.crew.dismiss()
-        books.close("KILLED")
+        recorder.close("KILLED")
         shutil.rmtree(root, ignore_errors=True)
 
 

@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipelines.batch import run_all
-from popgen.config import RunConfig, TrackingConfig
-from popgen.evaluation.comparison import Group, costs, group_runs, quality_costs
-from popgen.evaluation.comparison_report import Comparison, chosen_thresholds, to_dict, write_report
-from popgen.evaluation.runs import REAL, RunRecord, planned_run, read_run
+from popgen.config.run_config import RunConfig
+from popgen.config.sections import TrackingConfig
+from popgen.pipelines.run_batch import run_all
 from popgen.progress import Reporter
-from popgen.tracking import Tracker
+from popgen.reports.comparison import Group, costs, group_runs, quality_costs
+from popgen.reports.comparison_report import Comparison, chosen_thresholds, to_dict, write_report
+from popgen.reports.run_record import REAL, RunRecord, planned_run, read_run
+from popgen.runs.mlflow_tracker import Tracker
 
 EXPERIMENT = "popgen-compare"
 """Name of the MLflow experiment that comparisons go to."""
@@ -33,7 +34,7 @@ def compare_runs(
 
     Args:
         runs: (label or None for the method, folder).
-        starts: (label or None, run to start), see `pipelines.batch`; finished ones are not started again.
+        starts: (label or None, run to start), see `popgen.pipelines.run_batch`; finished ones are not started again.
         out: folder of the report and, without another URI, of `mlflow.db`.
         agents: M up to which costs are extrapolated.
         sp, xp: thresholds of equal quality; None takes the defaults.
@@ -41,7 +42,7 @@ def compare_runs(
         reporter: told of progress.
 
     Returns:
-        The object of `popgen.evaluation.comparison_report` and `files` (paths by name).
+        The object of `popgen.reports.comparison_report` and `files` (paths by name).
 
     Raises:
         UserError: a run that is unfinished or cannot be compared with the others, or one that fails.

@@ -9,15 +9,15 @@ from typing import Any
 
 import ray
 
-from actors.agent_learner import AgentActor
-from actors.common import options
-from actors.model_learner import ModelActor
-from actors.replay import ReplayActor
-from actors.sampler import SamplerActor
-from pipelines.play import Players
-from popgen.config import RunConfig
-from popgen.demands import demands, total
+from popgen.actors.actor_setup import options
+from popgen.actors.agent_actor import AgentActor
+from popgen.actors.replay_actor import ReplayActor
+from popgen.actors.sampler_actor import SamplerActor
+from popgen.actors.world_model_actor import ModelActor
+from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.pipelines.sampler_pool import SamplerPool
+from popgen.runs.resources import demands, total
 
 STARTS = 4
 LATE = "timed out during startup"
@@ -71,7 +71,7 @@ def _init(arguments: dict[str, Any]) -> None:
 class Crew:
     """Handles of one run's actors."""
 
-    players: Players
+    players: SamplerPool
     replay_sp: Any
     replay_xp: Any
     model: Any
@@ -86,7 +86,7 @@ class Crew:
         model = ray.remote(ModelActor).options(**options(cluster, cluster.model_cpus, cluster.model_gpus))
         agent = ray.remote(AgentActor).options(**options(cluster, cluster.agent_cpus, cluster.agent_gpus))
         crew = Crew(
-            players=Players(
+            players=SamplerPool(
                 [
                     sampler.remote(config.env, f"sampler{index}.{attempt}", cluster.threads)
                     for index in range(cluster.samplers)

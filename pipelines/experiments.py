@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipelines.batch import run_all
-from popgen.config import RunConfig
-from popgen.data.ledger import Ledger
+from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
-from popgen.evaluation import sabotage_report
-from popgen.evaluation.paper import METHOD_NAMES
-from popgen.evaluation.plots import path_grid, path_samples
 from popgen.evaluation.sabotage import Paths, SabotageResult, leave_event, measure_sabotage, to_dict
-from popgen.evaluation.sabotage_report import TERMINATIONS, build_report, termination_of
+from popgen.pipelines.run_batch import run_all
 from popgen.population import Population, load_population
 from popgen.progress import Reporter
+from popgen.reports import sabotage_report
+from popgen.reports.paper_figures import METHOD_NAMES
+from popgen.reports.plots import path_grid, path_samples
+from popgen.reports.sabotage_report import TERMINATIONS, build_report, termination_of
+from popgen.runs.ledger import Ledger
 from popgen.types import Kind, LedgerEntry
 
 METHODS = ("lipo", "comedi", "xpm_sim")
@@ -103,14 +103,14 @@ def self_sabotage(
 
     Args:
         sources: (method or another name, folder of a population or run).
-        starts: runs to start first, see `pipelines.batch`.
+        starts: runs to start first, see `popgen.pipelines.run_batch`.
         out: folder of the report, its figures and `ledger.jsonl`, which counts the evaluation's steps.
         episodes: per ordered pair of members.
         seed: of the evaluation.
         reporter: told of progress.
 
     Returns:
-        The object of `popgen.evaluation.sabotage_report` and `files` (paths by name).
+        The object of `popgen.reports.sabotage_report` and `files` (paths by name).
 
     Raises:
         UserError: see `open_sources`; a run that fails; a folder that cannot be written.

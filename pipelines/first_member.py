@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import ray
 
-from actors.sampler import Collected, PolicyParts
-from pipelines.checkpoints import fitting
-from pipelines.rounds import Pace, run_rounds
-from pipelines.snapshot import Published, Snapshot
-from popgen.algos.xpm_wm.starts import Starts
-from popgen.config import PREFILL_CHUNK
-from popgen.data.sampler import Team
-from popgen.policies.simple import RandomPolicy
+from popgen.actors.sampler_actor import Collected, PolicySnapshot
+from popgen.methods.xpm_wm.config import PREFILL_CHUNK
+from popgen.methods.xpm_wm.start_states import Starts
+from popgen.pipelines.rounds import Pace, run_rounds
+from popgen.pipelines.snapshot import Published, Snapshot
+from popgen.play.sampler import Match
+from popgen.policies.simple_policies import RandomPolicy
+from popgen.runs.checkpoints import fitting
 from popgen.types import RANDOM_MEMBER, Kind
 
 if TYPE_CHECKING:
-    from pipelines.xpm_wm import XpmWm
+    from popgen.pipelines.xpm_wm_driver import XpmWm
 
 MEMBER = 1
 LEARNERS = ("model", "agent")
@@ -97,9 +97,9 @@ class FirstMember:
             rest = (1.0 - interact) / (len(names) - 1)
             probabilities = [interact if name == "interact" else rest for name in names]
         random = RandomPolicy(driver.spec.num_actions, probabilities)
-        parts = {RANDOM_MEMBER: PolicyParts(random.kind, random.config(), {})}
-        team = Team(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), phase.envs)
-        driver.crew.players.open([team], parts, self.seed)
+        parts = {RANDOM_MEMBER: PolicySnapshot(random.kind, random.config(), {})}
+        match = Match(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), phase.envs)
+        driver.crew.players.open([match], parts, self.seed)
         while driver.steps < phase.prefill_steps:
             missing = (phase.prefill_steps - driver.steps) // phase.envs
             driver.play(MEMBER, max(1, min(PREFILL_CHUNK, missing)))
@@ -122,7 +122,7 @@ class FirstMember:
         """Fresh episodes of the published policy."""
         parts = {MEMBER: self.driver.parts(ray.get(self.published.acting))}
         seed = self.seed + 10_000 * (2 * self.confirmations - (not stagger))
-        self.driver.crew.players.open([Team(Kind.SP, (MEMBER, MEMBER), self.phase.envs)], parts, seed, stagger)
+        self.driver.crew.players.open([Match(Kind.SP, (MEMBER, MEMBER), self.phase.envs)], parts, seed, stagger)
 
     # ---- the rounds ------------------------------------------------------------------------------------------------
 

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import ray
 
-from pipelines.checkpoints import fitting
-from pipelines.snapshot import Published, Snapshot
-from popgen.algos.xpm_wm.partners import PartnerReturns
-from popgen.data.sampler import Episode, Team
 from popgen.nets.weights import under
+from popgen.pipelines.snapshot import Published, Snapshot
+from popgen.play.partner_strength import PartnerStrength
+from popgen.play.sampler import Episode, Match
+from popgen.runs.checkpoints import fitting
 from popgen.types import Kind
 
 if TYPE_CHECKING:
-    from pipelines.xpm_wm import XpmWm
+    from popgen.pipelines.xpm_wm_driver import XpmWm
 
 PIECE = 50
 """Agent updates between two signs of progress."""
@@ -31,7 +31,7 @@ class LaterMember:
         self.pairs = [pair for partner in self.partners for pair in ((member, partner), (partner, member))]
         # Every partner's cross-play must be known to tell the strongest, in both seats.
         self.episodes_xp = max(self.phase.episodes_xp, len(self.pairs))
-        self.returns = PartnerReturns(self.config.agent.partner)
+        self.returns = PartnerStrength(self.config.agent.partner)
         self.best: Snapshot | None = None
         self.number = 0
         self.plays = False
@@ -100,12 +100,12 @@ class LaterMember:
     def _real_episodes(self, acting: Any) -> list[Episode]:
         """One episode in each self-play and cross-play environment; partners act with their own archived filters."""
         driver, seed = self.driver, self.seed * 100 + self.number + 1
-        teams = [Team(Kind.SP, (self.member, self.member), self.phase.episodes_sp)]
+        matches = [Match(Kind.SP, (self.member, self.member), self.phase.episodes_sp)]
         order = np.random.default_rng(seed).permutation(len(self.pairs))
         counts = np.bincount(np.arange(self.episodes_xp) % len(self.pairs), minlength=len(self.pairs))
-        teams += [Team(Kind.XP, self.pairs[i], int(n)) for i, n in zip(order, counts, strict=True)]
+        matches += [Match(Kind.XP, self.pairs[i], int(n)) for i, n in zip(order, counts, strict=True)]
         weights = {**driver.members, self.member: acting}
-        driver.crew.players.open(teams, {m: driver.parts(weights[m]) for m in weights}, seed)
+        driver.crew.players.open(matches, {m: driver.parts(weights[m]) for m in weights}, seed)
         return driver.play(self.member, driver.spec.horizon)
 
     def _judge(self, published: Published, episodes: list[Episode]) -> None:

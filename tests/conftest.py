@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def random_population(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two uniformly random members for cramped_room with automatic cooking and episodes of 20 steps."""
     from popgen.envs import make_env
-    from popgen.policies.simple import RandomPolicy
+    from popgen.policies.simple_policies import RandomPolicy
     from popgen.population import PopulationWriter
 
     path = tmp_path_factory.mktemp("population") / "two_random"
@@ -41,9 +41,9 @@ def random_population(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's folder with two untrained members of the sizes of scale=smoke, and a checkpoint folder of the first."""
     from popgen.cli.compose import compose
-    from popgen.config import RunConfig
+    from popgen.config.run_config import RunConfig
     from popgen.envs import make_env
-    from popgen.policies.world_model_policy import WorldModelPolicy
+    from popgen.methods.xpm_wm.acting import WorldModelPolicy
     from popgen.population import PopulationWriter
 
     run = tmp_path_factory.mktemp("run") / "old"

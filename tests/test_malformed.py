@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
-from local_crew import LocalCrew
+from support.local_crew import LocalCrew
 
-from pipelines import population as main_job
-from pipelines import xpm_wm
-from pipelines.checkpoints import Checkpoints
 from popgen import cli
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
-from popgen.data.checkpoint import ARRAYS, VALUES, load_state, save_state
+from popgen.config.run_config import RunConfig
+from popgen.pipelines import population as main_job
+from popgen.pipelines import xpm_wm_driver as xpm_wm
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import Checkpoints
+from popgen.runs.state_files import ARRAYS, VALUES, load_state, save_state
 
 RUN = (
     *("scale=smoke", "tracking=off", "population.size=2", "env.params.horizon=20", "seed=3", "run.root=runs"),

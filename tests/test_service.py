@@ -24,12 +24,12 @@ import psutil
 import pytest
 from conftest import ROOT
 
-from pipelines.runs import describe_run
 from popgen import cli
-from popgen.data.ledger import Ledger
 from popgen.errors import UserError
 from popgen.population import load_population
-from popgen.preflight import check_kept
+from popgen.runs.directory import describe_run
+from popgen.runs.ledger import Ledger
+from popgen.runs.preflight import check_kept
 
 ENTRY = ROOT / "docker" / "entrypoint.sh"
 BIN = Path(sys.executable).parent

@@ -27,8 +27,8 @@ def compose(overrides: Sequence[str]) -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from conf import DIRECTORY
-    from popgen.config import RunConfig
+    from popgen.conf import DIRECTORY
+    from popgen.config.run_config import RunConfig
 
     ConfigStore.instance().store(name="schema", node=RunConfig().model_dump(mode="json"))
     GlobalHydra.instance().clear()
@@ -49,7 +49,7 @@ def compose(overrides: Sequence[str]) -> dict[str, Any]:
 
 def group_options(group: str) -> list[str]:
     """Names that `group=NAME` takes."""
-    from conf import DIRECTORY
+    from popgen.conf import DIRECTORY
 
     folder = DIRECTORY / group
     return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
@@ -87,7 +87,7 @@ def _composition_error(error: Exception, overrides: Sequence[str]) -> UserError:
     from hydra.errors import MissingConfigException, OverrideParseException
     from omegaconf.errors import InterpolationKeyError
 
-    from popgen.config import unknown_field
+    from popgen.config.run_config import unknown_field
 
     text = str(error)
     if isinstance(error, MissingConfigException) and "Could not find" in text:

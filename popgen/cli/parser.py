@@ -6,7 +6,11 @@ import argparse
 import sys
 
 import popgen
-from popgen.cli import bench, comparison, experiments, population, run
+from popgen.cli import bench_commands as bench
+from popgen.cli import compare_command as comparison
+from popgen.cli import experiment_commands as experiments
+from popgen.cli import population_commands as population
+from popgen.cli import run_command as run
 from popgen.cli.arguments import Parser
 from popgen.cli.printing import ERROR
 from popgen.errors import UserError

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from popgen.cli.compose import compose
 
 if TYPE_CHECKING:
-    from popgen.config import RunConfig
+    from popgen.config.run_config import RunConfig
 
 
 def bound_threads(count: int) -> None:
@@ -41,13 +41,13 @@ def runs_to_start(overrides: Sequence[Sequence[str]], out: str) -> list[RunConfi
     Raises:
         UserError: what cannot work.
     """
-    from popgen.config import RunConfig
-    from popgen.preflight import check_root, preflight
+    from popgen.config.run_config import RunConfig
+    from popgen.runs.preflight import check_root, preflight
 
     configs = [RunConfig.parse(compose(words)) for words in overrides]
     local = all(config.cluster.address is None for config in configs)
     before_ray(max((config.cluster.threads for config in configs), default=1), local)
-    from pipelines.batch import check_different, named
+    from popgen.pipelines.run_batch import check_different, named
 
     configs = [named(config, Path(out) / "runs") for config in configs]
     check_different(configs)

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from popgen.envs.base import BatchedEnv, ViewSpec
-from popgen.envs.registry import make_env
+from popgen.envs.contract import BatchedEnv, ViewSpec
+from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
 from popgen.types import StepBatch
 

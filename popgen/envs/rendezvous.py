@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from popgen.envs.base import BatchedEnv, EnvSpec, ViewSpec
+from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
 from popgen.envs.drawing import canvas, disc, rectangle
 from popgen.errors import UserError
 from popgen.shapes import check

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from popgen.envs.base import EnvSpec
+from popgen.envs.contract import EnvSpec
 from popgen.types import Segment, StepBatch
 
 

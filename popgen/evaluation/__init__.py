@@ -1,1 +1,1 @@
-"""Evaluation: full episodes of any teams, cross-play figures, reports and plots."""
+"""Evaluation of populations: cross-play and self-sabotage."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from popgen.errors import UserError
-from popgen.evaluation.rollout import Episodes, play_teams
-from popgen.policies.base import Policy
-from popgen.policies.simple import IdlePolicy, RandomPolicy
+from popgen.play.policy import Policy
+from popgen.play.rollout import Episodes, play_teams
+from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 from popgen.population.manifest import EnvironmentInfo
 from popgen.population.store import Population
 
@@ -195,10 +195,12 @@ def evaluate_population(
     policies += [RandomPolicy(spec.num_actions), IdlePolicy(spec.action_names)]
     count = len(chosen)
     # All pairs but those of the two partners among themselves.
-    teams = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
-    played = play_teams(population.make_env, policies, teams, episodes, seed=seed, max_envs=max_envs, progress=progress)
+    matches = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
+    played = play_teams(
+        population.make_env, policies, matches, episodes, seed=seed, max_envs=max_envs, progress=progress
+    )
     pairings = {}
-    for n, (i, j) in enumerate(teams):
+    for n, (i, j) in enumerate(matches):
         rows = slice(n * episodes, (n + 1) * episodes)
         pairings[labels[i], labels[j]] = _pairing((labels[i], labels[j]), played, rows)
     return CrossPlayResult(

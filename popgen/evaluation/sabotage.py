@@ -18,12 +18,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from popgen.envs.base import BatchedEnv, EnvSpec
-from popgen.envs.registry import make_env
+from popgen.envs.contract import BatchedEnv, EnvSpec
+from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import Estimate
-from popgen.evaluation.rollout import Episodes, Transition, play
-from popgen.policies.base import Policy
+from popgen.play.policy import Policy
+from popgen.play.rollout import Episodes, Transition, play
 from popgen.population.store import Population
 
 LEAVES = "leaves"
@@ -174,12 +174,12 @@ def measure_sabotage(
     if episodes < 1:
         raise UserError("episodes", f"must be at least 1, got {episodes}")
     info, count = population.env_info, len(population)
-    teams = np.array([(i, j) for i in range(count) for j in range(count)])
-    env = make_env(info.name, len(teams) * episodes, seed=0, **{**info.params, **(params or {})})
+    matches = np.array([(i, j) for i in range(count) for j in range(count)])
+    env = make_env(info.name, len(matches) * episodes, seed=0, **{**info.params, **(params or {})})
     event = env.spec.event_names.index(leave_event(env.spec))
     policies: list[Policy] = [population[member + 1] for member in range(count)]
     recorder = _Recorder(env)
-    played = play(env, policies, np.repeat(teams, episodes, axis=0), seed=seed, record=recorder)
+    played = play(env, policies, np.repeat(matches, episodes, axis=0), seed=seed, record=recorder)
     shape = (count, count, episodes)
     exits = (played.events[..., event] > 0).reshape(*shape, -1)
     return SabotageResult(

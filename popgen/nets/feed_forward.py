@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from popgen.envs.base import ViewSpec
+from popgen.envs.contract import ViewSpec
 from popgen.shapes import check
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "leaky_relu": nn.LeakyReLU}

@@ -1,9 +1,1 @@
-"""Policies: anything that looks at a joint observation and answers with an action for each seat."""
-
-from popgen.policies.base import Policy
-from popgen.policies.feed_forward import FeedForwardPolicy
-from popgen.policies.registry import POLICIES, build_policy
-from popgen.policies.seating import Seating
-from popgen.policies.simple import IdlePolicy, RandomPolicy
-
-__all__ = ["POLICIES", "FeedForwardPolicy", "IdlePolicy", "Policy", "RandomPolicy", "Seating", "build_policy"]
+"""Policies that several methods share, the registry of policy kinds, and the adapter to overcooked_ai's agents."""

@@ -14,7 +14,7 @@ from overcooked_ai_py.mdp.actions import Action
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.envs.overcooked.bridge import from_overcooked_ai, infer_joint_action
 from popgen.errors import UserError
-from popgen.policies.base import Policy
+from popgen.play.policy import Policy
 
 
 class OvercookedAgent(Agent):

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 import popgen
-from popgen.envs.base import EnvSpec
+from popgen.envs.contract import EnvSpec
 from popgen.jsonable import jsonable
 from popgen.types import Kind
 

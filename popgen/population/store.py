@@ -13,8 +13,8 @@ import numpy as np
 from popgen.envs import BatchedEnv, EnvSpec, make_env
 from popgen.errors import UserError
 from popgen.jsonable import jsonable
-from popgen.policies.base import Policy
-from popgen.policies.registry import build_policy
+from popgen.play.policy import Policy
+from popgen.policies.policy_registry import build_policy
 from popgen.population import files
 from popgen.population.manifest import (
     FORMAT,

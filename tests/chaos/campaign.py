@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from faults import FAULTS, Fault, Hit
-from site_of_chaos import Books, Site, events, repeated
+from site_of_chaos import RunRecorder, Site, events, repeated
 
 TRIES = 5
 """Of a fault whose run ended before its moment came."""
@@ -70,11 +70,13 @@ def reference(site: Site, method: str) -> dict[str, Any]:
     outcome = site.finish(site.start(site.overrides(name, f"method={method}", "tracking=off"), log), log)
     if outcome.code:
         raise SystemExit(f"the undisturbed run of {method} ended with {outcome.code}: {outcome.error}")
-    print(f"{name}: {time.time() - began:.0f} s, {events(run)} events, {Books.of(run).totals['total']}", flush=True)
+    print(
+        f"{name}: {time.time() - began:.0f} s, {events(run)} events, {RunRecorder.of(run).totals['total']}", flush=True
+    )
     # A machine that is short of memory hits even this run; what it did again is no moment of its own.
     rows = [json.loads(text) for text in (run / "run.log").read_text().splitlines()]
     moments = {(row["event"], row.get("member"), row.get("iteration"), row.get("text")) for row in rows}
-    return {"books": Books.of(run), "events": len(moments)}
+    return {"recorder": RunRecorder.of(run), "events": len(moments)}
 
 
 def strike(
@@ -96,11 +98,11 @@ def strike(
     if not hit.struck or hit.code:
         problem = f"exit {hit.code}: {hit.told}" if hit.code else f"the run ended before it, {TRIES} times"
         return row | {"survived": False, "problem": problem}
-    books, wanted = Books.of(run), known["books"]
-    problems = [what for what in ("weights", "entries", "totals") if getattr(books, what) != getattr(wanted, what)]
+    recorder, wanted = RunRecorder.of(run), known["recorder"]
+    problems = [what for what in ("weights", "entries", "totals") if getattr(recorder, what) != getattr(wanted, what)]
     problems += ["error text"] * (fault.one_line and not one_line(hit.told))
     attempts = len((run / "attempts.txt").read_text().splitlines())
-    row |= {"attempts": attempts, "repeated": repeated(run), "weights": books.weights[-1][:12]}
+    row |= {"attempts": attempts, "repeated": repeated(run), "weights": recorder.weights[-1][:12]}
     return row | {"survived": not problems, "problem": ", ".join(problems)}
 
 

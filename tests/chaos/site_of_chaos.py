@@ -20,8 +20,8 @@ from typing import Any
 import psutil
 from ray.cluster_utils import Cluster
 
-from popgen.data.ledger import Ledger
 from popgen.population import load_population
+from popgen.runs.ledger import Ledger
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 NEAR, FAR = "near", "far"
@@ -167,7 +167,7 @@ def events(run: Path) -> int:
 
 
 @dataclass(frozen=True)
-class Books:
+class RunRecorder:
     """What must be the same, whatever happened: weights, entries and totals of the ledger."""
 
     weights: tuple[str, ...]
@@ -175,11 +175,11 @@ class Books:
     totals: dict[str, Any]
 
     @staticmethod
-    def of(run: Path) -> Books:
+    def of(run: Path) -> RunRecorder:
         ledger = Ledger(run / "ledger.jsonl")
         entries = Counter((e.member, str(e.kind), e.sampler.partition(".")[0], e.steps, e.episodes) for e in ledger)
         members = load_population(run / "population").members
-        return Books(tuple(info.policy_sha256 for info in members), entries, ledger.table())
+        return RunRecorder(tuple(info.policy_sha256 for info in members), entries, ledger.table())
 
 
 def repeated(run: Path) -> int:

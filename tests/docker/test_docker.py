@@ -279,8 +279,8 @@ def test_the_pods_of_the_rayjob_share_the_runs_and_are_no_root() -> None:
 
 
 def test_the_entrypoint_of_the_rayjob_is_a_run_that_its_cluster_can_hold() -> None:
-    from popgen.config import RunConfig
-    from popgen.demands import check_room, demands
+    from popgen.config.run_config import RunConfig
+    from popgen.runs.resources import check_room, demands
 
     _, job = rayjob()
     program, command, *overrides = shlex.split(job["spec"]["entrypoint"])

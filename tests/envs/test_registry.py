@@ -1,4 +1,4 @@
-"""Every registered environment keeps the protocol of popgen/envs/base.py; nothing here knows a game."""
+"""Every registered environment keeps the protocol of popgen/envs/contract.py; nothing here knows a game."""
 
 from __future__ import annotations
 

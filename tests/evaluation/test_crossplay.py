@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scripted import HORIZON, ONE, STAY, TWO, Cast, Script
+from support.scripted import HORIZON, ONE, STAY, TWO, Cast, Script
 
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import CrossPlayResult, Estimate, Obstruction, Pairing, evaluate_population

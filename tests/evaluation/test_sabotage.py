@@ -16,11 +16,11 @@ from matplotlib.image import imread
 from popgen.envs import make_env
 from popgen.envs.rendezvous import worst_reward
 from popgen.errors import UserError
-from popgen.evaluation import plots, sabotage_report
-from popgen.evaluation.paper import SABOTAGE
 from popgen.evaluation.sabotage import SabotageResult, leave_event, measure_sabotage, to_dict
-from popgen.evaluation.sabotage_report import PENALTY, PLAIN, TERMINATIONS, build_report
 from popgen.population.manifest import EnvironmentInfo
+from popgen.reports import plots, sabotage_report
+from popgen.reports.paper_figures import SABOTAGE
+from popgen.reports.sabotage_report import PENALTY, PLAIN, TERMINATIONS, build_report
 
 STAY, LEFT, RIGHT, DOWN, UP = range(5)
 Rule = Callable[[np.ndarray, int], np.ndarray]

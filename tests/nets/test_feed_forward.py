@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from popgen.envs import make_env
-from popgen.envs.base import ViewSpec
+from popgen.envs.contract import ViewSpec
 from popgen.nets.feed_forward import FeedForwardNet, Sizes, ValueNet, joint, joint_copies, orthogonal
-from popgen.policies import FeedForwardPolicy, build_policy
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.policy_registry import build_policy
 
 FLAT = ViewSpec((3,), "float32", False, 2.0)
 GRID = ViewSpec((4, 3, 2), "uint8", False, 20.0, maxima=(1.0, 20.0))

@@ -18,18 +18,20 @@ import pytest
 import ray
 import torch
 
-from pipelines import baselines, checkpoints
-from pipelines.books import Books
-from pipelines.population import driver_class, run_population
 from popgen.cli.compose import compose
-from popgen.config import ClusterConfig, RunConfig
-from popgen.data.ledger import Ledger
+from popgen.config.run_config import RunConfig
+from popgen.config.sections import ClusterConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.methods.mappo.algorithm import Mappo as Algorithm
+from popgen.pipelines import baseline_driver as baselines
+from popgen.pipelines.population import driver_class, run_population
 from popgen.population import Population, load_population
-from popgen.preflight import preflight
 from popgen.progress import NullReporter
-from popgen.rllib.algorithm import Mappo as Algorithm
+from popgen.runs import checkpoints
+from popgen.runs.ledger import Ledger
+from popgen.runs.preflight import preflight
+from popgen.runs.recorder import RunRecorder
 
 HORIZON = 40
 SP_STEPS = 240
@@ -122,7 +124,7 @@ def launch(
             called("save")
             original(folder, state)
 
-        def add(self: Books, *given: Any, original: Any = Books.add_member, **named: Any) -> None:
+        def add(self: RunRecorder, *given: Any, original: Any = RunRecorder.add_member, **named: Any) -> None:
             called("add")
             original(self, *given, **named)
             called("added")
@@ -130,14 +132,14 @@ def launch(
         patch.setattr(Algorithm, "train", train)
         for module in (baselines, checkpoints):
             patch.setattr(module, "save_state", save)
-        patch.setattr(Books, "add_member", add)
+        patch.setattr(RunRecorder, "add_member", add)
         spec = make_env(config.env.name, 1, **config.env.params).spec
-        books = Books(config, spec)
+        recorder = RunRecorder(config, spec)
         try:
-            driver_class(config.method)(config, spec, books, reporter).run()
+            driver_class(config.method)(config, spec, recorder, reporter).run()
         finally:
-            books.close("FINISHED")
-    return Run(books.dir, said, reporter.notes)
+            recorder.close("FINISHED")
+    return Run(recorder.dir, said, reporter.notes)
 
 
 SIZES = {"mappo": "population.size=2", "lipo": "population.size=3", "comedi": "population.size=3"}

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import pytest
 
-from pipelines.bench_mappo import _train, bench_mappo
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
+from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
-from popgen.rllib.algorithm import Counted, Report
+from popgen.methods.mappo.algorithm import Counted, Report
+from popgen.pipelines.bench_mappo import _train, bench_mappo
 from popgen.types import Kind
 
 pytestmark = pytest.mark.usefixtures("cluster")

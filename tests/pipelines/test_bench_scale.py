@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines.bench_scale import NETWORK, Costs
+from popgen.pipelines.bench_scale import NETWORK, Costs
 
 COSTS = Costs(steps=6400.0, sampler=1.0, driver=0.1, model=0.5, agent=2.0, data=1e6)
 

@@ -10,20 +10,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from finished import CRAMPED, finished_run
+from support.finished import CRAMPED, finished_run
 
-import pipelines
-from pipelines.batch import check_different, named, run_all
-from pipelines.experiments import open_sources, sample_pair
-from popgen.config import RunConfig
-from popgen.data.ledger import Ledger
+import popgen.pipelines as pipelines
+from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.evaluation.sabotage import measure_sabotage
-from popgen.policies.simple import IdlePolicy, RandomPolicy
+from popgen.pipelines.experiments import open_sources, sample_pair
+from popgen.pipelines.run_batch import check_different, named, run_all
+from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 from popgen.population import PopulationWriter, load_population
 from popgen.progress import NullReporter
-from popgen.tracking import SCALING_METRIC
+from popgen.runs.ledger import Ledger
+from popgen.runs.mlflow_tracker import SCALING_METRIC
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -40,9 +40,9 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[RunConfig]:
         root, seed = Path(config.run.root), config.run.seed
         finished_run(root, str(config.run.id), steps, method=config.method, seed=seed, env=name, params=params)
 
-    module = type(sys)("pipelines.population")
+    module = type(sys)("popgen.pipelines.population")
     module.run_population = train  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "pipelines.population", module)
+    monkeypatch.setitem(sys.modules, "popgen.pipelines.population", module)
     monkeypatch.setattr(pipelines, "population", module, raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
     return calls

@@ -5,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from actors.sampler import PolicyParts
-from pipelines import crew, play
-from pipelines.play import seed_of
-from popgen.config import RunConfig
-from popgen.data.sampler import Team
+from popgen.actors.sampler_actor import PolicySnapshot
+from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.pipelines import crew
+from popgen.pipelines import sampler_pool as play
+from popgen.pipelines.sampler_pool import seed_of
+from popgen.play.sampler import Match
 from popgen.types import Kind
 
 
@@ -46,13 +47,13 @@ def test_weights_are_stored_once_for_each_version_whoever_plays_with_them(monkey
     monkeypatch.setattr(play.ray, "get", lambda references: None)
 
     class Sampler:
-        open = SimpleNamespace(remote=lambda teams, parts, seed, stagger: opened.append(parts))
+        open = SimpleNamespace(remote=lambda matches, parts, seed, stagger: opened.append(parts))
 
-    players = play.Players([Sampler()] * 3)
-    teams = [Team(Kind.XP, (1, 2), 6)]
+    players = play.SamplerPool([Sampler()] * 3)
+    matches = [Match(Kind.XP, (1, 2), 6)]
     old, first, second = ({"w": np.zeros(3)} for _ in range(3))
     for newest in (first, first, second):
-        players.open(teams, {1: PolicyParts("k", {}, old), 2: PolicyParts("k", {}, newest)}, seed=0)
+        players.open(matches, {1: PolicySnapshot("k", {}, old), 2: PolicySnapshot("k", {}, newest)}, seed=0)
     assert [parts.weights for parts in stored] == [old, first, second]
     a, b, c = "reference 1", "reference 2", "reference 3"
     assert opened == [{1: a, 2: b}] * 6 + [{1: a, 2: c}] * 3

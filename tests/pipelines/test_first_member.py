@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from pipelines.first_member import FirstMember
-from popgen.config import Phase1Config, RunConfig
+from popgen.config.run_config import RunConfig
+from popgen.methods.xpm_wm.config import Phase1Config
+from popgen.pipelines.first_member import FirstMember
 
 
 def member(**phase: Any) -> FirstMember:
@@ -98,7 +99,7 @@ class Alone:
         self.config, self.scores, self.steps = config, list(scores), steps
         self.spec = SimpleNamespace(horizon=10, score_name="dishes")
         self.reporter, self.seeds = SimpleNamespace(note=lambda text: None), []
-        players = SimpleNamespace(open=lambda teams, parts, seed, stagger: self.seeds.append((seed, stagger)))
+        players = SimpleNamespace(open=lambda matches, parts, seed, stagger: self.seeds.append((seed, stagger)))
         self.crew = SimpleNamespace(players=players)
 
     def parts(self, acting: Any) -> Any:
@@ -112,7 +113,7 @@ class Alone:
 
 def test_the_last_policy_must_reach_the_target_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """9.69 of 10 is too little, 9.7 enough; every look has fresh episodes, and play between them too."""
-    monkeypatch.setattr("pipelines.first_member.ray.get", lambda reference: reference)
+    monkeypatch.setattr("popgen.pipelines.first_member.ray.get", lambda reference: reference)
     first = member(target_score=10.0, max_steps=10_000)
     first.published = SimpleNamespace(acting=None)  # type: ignore[assignment]
     first.driver = driver = Alone(first.config, [9.69] * 16, [9.7] * 16)  # type: ignore[assignment]

@@ -14,25 +14,25 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
-from local_crew import LocalCrew
+from support.local_crew import LocalCrew
 
-from actors.sampler import Collected
-from pipelines import population as main_job
-from pipelines import xpm_wm as pipeline
-from pipelines.books import Books
-from pipelines.checkpoints import Checkpoints
-from pipelines.crew import Crew
-from pipelines.later_member import LaterMember
-from pipelines.population import run_population
+from popgen.actors.sampler_actor import Collected
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
-from popgen.data.checkpoint import load_state
-from popgen.data.ledger import Ledger
-from popgen.data.replay import KIND_CODE
+from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.methods.xpm_wm.replay import KIND_CODE
+from popgen.pipelines import population as main_job
+from popgen.pipelines import xpm_wm_driver as pipeline
+from popgen.pipelines.crew import Crew
+from popgen.pipelines.later_member import LaterMember
+from popgen.pipelines.population import run_population
 from popgen.population import Population, load_population
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import Checkpoints
+from popgen.runs.ledger import Ledger
+from popgen.runs.recorder import RunRecorder
+from popgen.runs.state_files import load_state
 from popgen.types import Kind
 
 pytestmark = pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")  # as in the actors
@@ -93,7 +93,7 @@ def launch(
 ) -> Run:
     """Run it, listening to what the samplers say; without processes of its own if `local`.
 
-    die_at: METHOD:N of the books or the checkpoints; the run dies at the beginning of the N-th call of it.
+    die_at: METHOD:N of the recorder or the checkpoints; the run dies at the beginning of the N-th call of it.
     kills: METHOD:N -> the actor whose process is killed then.
     """
     config = smoke(root, name, *overrides)
@@ -115,7 +115,7 @@ def launch(
             crews.append((LocalCrew if local else Crew).hire(*given))
             return crews[-1]
 
-    class Listening(Books):
+    class Listening(RunRecorder):
         def record(self, member: int, said: Collected) -> None:
             called("record")
             collected.append((member, said))
@@ -131,7 +131,7 @@ def launch(
             super().save(*given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(main_job, "Books", Listening)
+        patch.setattr(main_job, "RunRecorder", Listening)
         patch.setattr(pipeline, "Checkpoints", Mortal)
         patch.setattr(pipeline, "Crew", Hired)
         return Run(run_population(config, reporter=NullReporter()), collected)
@@ -370,13 +370,13 @@ def test_a_run_that_goes_on_from_another_can_be_interrupted_before_its_first_own
     config = smoke(root, "early", f"population.init_from={whole.dir}", "population.init_members=1")
     for attempt in (1, 2):
         loaded.clear()
-        books = Books(config, whole.population.spec)
-        driver = pipeline.XpmWm(config, whole.population.spec, books, NullReporter())
+        recorder = RunRecorder(config, whole.population.spec)
+        driver = pipeline.XpmWm(config, whole.population.spec, recorder, NullReporter())
         with monkeypatch.context() as patch:
             patch.setattr(ray, "get", lambda references: references)
             known, base, saved = driver._resume()
             assert (known, base, saved) == (1, whole.dir / "checkpoints" / "member_001", None)
-        assert books.attempt == attempt and len(books.population) == 1 and len(loaded) == 3
+        assert recorder.attempt == attempt and len(recorder.population) == 1 and len(loaded) == 3
         assert driver.members.keys() == {1}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pipelines import rounds
+from popgen.pipelines import rounds
 
 
 @dataclass(frozen=True)

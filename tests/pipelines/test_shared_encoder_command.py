@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from finished import finished_run
+from support.finished import finished_run
 
 from popgen.cli import main
 

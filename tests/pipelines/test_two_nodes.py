@@ -13,17 +13,17 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from actors.sampler import Collected
-from pipelines import population as main_job
-from pipelines import xpm_wm
-from pipelines.books import Books
-from pipelines.crew import Crew
-from pipelines.population import run_population
+from popgen.actors.sampler_actor import Collected
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
-from popgen.data.ledger import Ledger
+from popgen.config.run_config import RunConfig
+from popgen.pipelines import population as main_job
+from popgen.pipelines import xpm_wm_driver as xpm_wm
+from popgen.pipelines.crew import Crew
+from popgen.pipelines.population import run_population
 from popgen.population import load_population
 from popgen.progress import NullReporter
+from popgen.runs.ledger import Ledger
+from popgen.runs.recorder import RunRecorder
 
 QUICK = {"health_check_initial_delay_ms": 1000, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
 """A dead node is noticed in seconds."""
@@ -57,7 +57,7 @@ def run(cluster: Cluster, root: Path, name: str, at_record: Callable[[int, Crew]
             crews.append(Crew.hire(*given))
             return crews[-1]
 
-    class Listening(Books):
+    class Listening(RunRecorder):
         def record(self, member: int, said: Collected) -> None:
             calls.append(member)
             at_record(len(calls), crews[-1])
@@ -65,7 +65,7 @@ def run(cluster: Cluster, root: Path, name: str, at_record: Callable[[int, Crew]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(xpm_wm, "Crew", Hired)
-        patch.setattr(main_job, "Books", Listening)
+        patch.setattr(main_job, "RunRecorder", Listening)
         run_population(RunConfig.parse(compose(overrides)), reporter=NullReporter())
     return root / name
 

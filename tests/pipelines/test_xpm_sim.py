@@ -1,4 +1,4 @@
-"""Whole runs of XPM-Sim at `scale=smoke`: the books, twice the same, interrupted anywhere, both schedules."""
+"""Whole runs of XPM-Sim at `scale=smoke`: the recorder, twice the same, interrupted anywhere, both schedules."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
-from local_crew import Handle
+from support.local_crew import Handle
 
-from actors.common import build_env
-from actors.exact_learner import ExactLearnerActor
-from actors.sampler import SamplerActor
-from pipelines import xpm_sim as pipeline
-from pipelines.books import Books
-from pipelines.checkpoints import Checkpoints
-from pipelines.play import Players
-from pipelines.population import run_population
-from pipelines.xpm_sim import Member
+from popgen.actors.actor_setup import build_env
+from popgen.actors.sampler_actor import SamplerActor
+from popgen.actors.simulated_agent_actor import ExactLearnerActor
 from popgen.cli.compose import compose
-from popgen.config import RunConfig
-from popgen.data.ledger import Ledger
+from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.pipelines import xpm_sim_driver as pipeline
+from popgen.pipelines.population import run_population
+from popgen.pipelines.sampler_pool import SamplerPool
+from popgen.pipelines.xpm_sim_driver import Member
 from popgen.population import load_population
-from popgen.preflight import preflight
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import Checkpoints
+from popgen.runs.ledger import Ledger
+from popgen.runs.preflight import preflight
+from popgen.runs.recorder import RunRecorder
 from popgen.types import Kind
 
 pytestmark = pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")  # as in the actors
@@ -49,7 +49,7 @@ class LocalCrew(pipeline.Crew):
     def hire(config: RunConfig, attempt: str) -> LocalCrew:
         names = [f"sampler{i}.{attempt}" for i in range(config.cluster.samplers)]
         samplers = [Handle(SamplerActor(config.env, name, 1)) for name in names]
-        return LocalCrew(Players(samplers), Handle(ExactLearnerActor(config, 1)))
+        return LocalCrew(SamplerPool(samplers), Handle(ExactLearnerActor(config, 1)))
 
     def dismiss(self) -> None:
         """There is nobody to send away."""
@@ -69,7 +69,7 @@ def configured(root: Path, name: str, *overrides: str) -> RunConfig:
 def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
     """Train without Ray, objects in place of references; the run's folder.
 
-    die_at: METHOD:N of the books or checkpoints; the run dies before the N-th call of it.
+    die_at: METHOD:N of the recorder or checkpoints; the run dies before the N-th call of it.
     """
     config = configured(root, name, *overrides)
     method, _, number = die_at.partition(":")
@@ -90,13 +90,13 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
         patch.setattr(ray, "put", lambda given: given)
         patch.setattr(pipeline, "Crew", LocalCrew)
         patch.setattr(pipeline, "Checkpoints", mortal(Checkpoints, "save"))
-        kind = mortal(mortal(mortal(Books, "record"), "record_steps"), "add_member")
+        kind = mortal(mortal(mortal(RunRecorder, "record"), "record_steps"), "add_member")
         spec = build_env(config.env, 1).spec
-        books = kind(config, spec)
+        recorder = kind(config, spec)
         try:
-            pipeline.XpmSim(config, spec, books, NullReporter()).run()
+            pipeline.XpmSim(config, spec, recorder, NullReporter()).run()
         finally:
-            books.close("FINISHED")
+            recorder.close("FINISHED")
     return root / name
 
 
@@ -116,16 +116,16 @@ def whole(root: Path) -> Path:
 
 
 def test_every_step_is_counted_once_by_kind(whole: Path) -> None:
-    books, sims = Ledger(whole / "ledger.jsonl"), 10 * 2 * ROUNDS  # unroll x updates
+    recorder, sims = Ledger(whole / "ledger.jsonl"), 10 * 2 * ROUNDS  # unroll x updates
     for member, columns in ((1, 4), (2, 12), (3, 12)):
         check = 4 * HORIZON // 2 * (1 if member == 1 else 2)
-        assert books.steps(member, Kind.SP) == ROUNDS * 2 * HORIZON
-        assert books.steps(member, Kind.XP) == (0 if member == 1 else ROUNDS * 2 * HORIZON)
-        assert books.steps(member, Kind.SIMULATED) == sims * columns + check
-        assert books.episodes(member, Kind.SP) == ROUNDS * 2
+        assert recorder.steps(member, Kind.SP) == ROUNDS * 2 * HORIZON
+        assert recorder.steps(member, Kind.XP) == (0 if member == 1 else ROUNDS * 2 * HORIZON)
+        assert recorder.steps(member, Kind.SIMULATED) == sims * columns + check
+        assert recorder.episodes(member, Kind.SP) == ROUNDS * 2
     infos = load_population(whole / "population").members
     assert [info.steps for info in infos] == [{"SP": 80}, {"SP": 80, "XP": 80}, {"SP": 80, "XP": 80}]
-    assert [info.extra["simulated_steps"] for info in infos] == [books.steps(m, Kind.SIMULATED) for m in (1, 2, 3)]
+    assert [info.extra["simulated_steps"] for info in infos] == [recorder.steps(m, Kind.SIMULATED) for m in (1, 2, 3)]
 
 
 def test_members_act_and_their_figures_are_told(whole: Path) -> None:
@@ -185,9 +185,9 @@ def test_a_finished_run_called_again_trains_nothing(whole: Path, root: Path) -> 
 
 def test_async_overlaps_and_counts_the_same_steps(whole: Path, root: Path) -> None:
     overlapped = launch(root, "async", "run.schedule=async", "population.size=2", "cluster.samplers=2")
-    books, other = Ledger(overlapped / "ledger.jsonl"), Ledger(whole / "ledger.jsonl")
+    recorder, other = Ledger(overlapped / "ledger.jsonl"), Ledger(whole / "ledger.jsonl")
     for kind in (Kind.SP, Kind.XP, Kind.SIMULATED):
-        assert books.steps(2, kind) == other.steps(2, kind)
+        assert recorder.steps(2, kind) == other.steps(2, kind)
 
 
 def test_rendezvous_and_no_cross_play_pressure(root: Path) -> None:
@@ -208,16 +208,16 @@ def test_partners_take_turns_in_both_seats() -> None:
     member = Member(driver(3, episodes_xp=4), 4)
     seen: Counter[tuple[int, int]] = Counter()
     for member.round in range(3):
-        teams = member._teams()
-        assert (teams[0].members, teams[0].envs) == ((4, 4), 2)
-        assert sum(team.envs for team in teams[1:]) == 4
-        seen.update({team.members: team.envs for team in teams[1:]})
+        matches = member._teams()
+        assert (matches[0].members, matches[0].envs) == ((4, 4), 2)
+        assert sum(match.envs for match in matches[1:]) == 4
+        seen.update({match.members: match.envs for match in matches[1:]})
     assert seen == {pair: 2 for k in (1, 2, 3) for pair in ((4, k), (k, 4))}
 
 
 def test_more_episodes_than_pairs_are_shared_evenly() -> None:
-    teams = Member(driver(1, episodes_xp=5), 2)._teams()
-    assert {team.members: team.envs for team in teams[1:]} == {(2, 1): 3, (1, 2): 2}
+    matches = Member(driver(1, episodes_xp=5), 2)._teams()
+    assert {match.members: match.envs for match in matches[1:]} == {(2, 1): 3, (1, 2): 2}
     assert len(Member(driver(0), 1)._teams()) == 1
 
 

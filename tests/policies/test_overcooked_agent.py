@@ -15,9 +15,10 @@ from popgen.envs import BatchedEnv, make_env
 from popgen.envs.overcooked.bridge import from_overcooked_ai, to_overcooked_mdp
 from popgen.envs.overcooked.kernels import TIME
 from popgen.errors import UserError
-from popgen.evaluation.rollout import Transition, play
-from popgen.policies import FeedForwardPolicy, IdlePolicy
+from popgen.play.rollout import Transition, play
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.overcooked_agent import OvercookedAgent
+from popgen.policies.simple_policies import IdlePolicy
 from popgen.population import load_population
 from tests.envs.cooks import Cook, Kitchen
 

@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small import AGENT, MODEL
+from support.small import AGENT, MODEL
 
 from popgen.envs import EnvSpec, make_env
-from popgen.policies import POLICIES, FeedForwardPolicy, IdlePolicy, Policy, RandomPolicy, build_policy
-from popgen.policies.registry import policy_class
+from popgen.play.policy import Policy
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.policy_registry import POLICIES, build_policy, policy_class
+from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,8 @@ from safetensors.numpy import load_file, save, save_file
 
 from popgen.envs import make_env
 from popgen.errors import UserError
-from popgen.policies import FeedForwardPolicy, IdlePolicy
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.simple_policies import IdlePolicy
 from popgen.population import PopulationWriter, load_population
 from popgen.population.files import digest, read_tensors
 

@@ -13,7 +13,7 @@ PROGRAM = """
 import sys
 
 BLOCKED = {"ray", "hydra", "omegaconf", "mlflow", "pettingzoo", "gymnasium", "matplotlib"}
-OURS = {"popgen.algos", "popgen.rllib", "popgen.tracking", "popgen.cli", "actors", "pipelines"}
+OURS = {"popgen.algos", "popgen.rllib", "popgen.runs.mlflow_tracker", "popgen.cli", "actors", "pipelines"}
 
 
 class Blocker:
@@ -32,7 +32,7 @@ else:
     raise SystemExit("ray was not blocked")
 import numpy as np
 import popgen
-from popgen.evaluation.rollout import play
+from popgen.play.rollout import play
 
 population = popgen.load_population(sys.argv[1])
 env = population.make_env(2, seed=0)

@@ -8,7 +8,8 @@ import numpy as np
 from rich.console import Console
 
 from popgen.envs import make_env
-from popgen.policies import FeedForwardPolicy, RandomPolicy
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.simple_policies import RandomPolicy
 from popgen.population import PopulationWriter, load_population
 from popgen.population.show import describe, render
 

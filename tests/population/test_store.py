@@ -12,8 +12,9 @@ import pytest
 
 from popgen.envs import EnvSpec, make_env
 from popgen.errors import UserError
-from popgen.evaluation.rollout import play
-from popgen.policies import FeedForwardPolicy, RandomPolicy
+from popgen.play.rollout import play
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.simple_policies import RandomPolicy
 from popgen.population import Population, PopulationWriter, check_compatible, files, load_population
 
 RUN = {"method": "xpm_wm", "config_digest": "d" * 64, "seed": 4}
@@ -36,9 +37,13 @@ def fill(writer: PopulationWriter, spec: EnvSpec, members: int) -> None:
 
 def trajectory(population: Population, members: tuple[int, int]) -> np.ndarray:
     steps: list[np.ndarray] = []
-    teams = [population[members[0]], population[members[1]]]
+    matches = [population[members[0]], population[members[1]]]
     play(
-        population.make_env(4), teams, np.tile([[0, 1]], (4, 1)), seed=2, record=lambda step: steps.append(step.actions)
+        population.make_env(4),
+        matches,
+        np.tile([[0, 1]], (4, 1)),
+        seed=2,
+        record=lambda step: steps.append(step.actions),
     )
     return np.stack(steps)
 

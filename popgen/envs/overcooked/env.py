@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from popgen.envs.base import BatchedEnv, EnvSpec, ViewSpec
+from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked import render
 from popgen.envs.overcooked.layout import load_layout

@@ -170,7 +170,7 @@ def _set_item(out, at, other, item, table, bit_row):
 
 @njit(_nrt=False)
 def _player_features(states, s, table, meta, out, at, other):
-    """Players' part of both views, player 1's at out[at:] and player 2's at out[other:]; own entries first."""
+    """SamplerPool' part of both views, player 1's at out[at:] and player 2's at out[other:]; own entries first."""
     floor, items = meta[M_FLOOR], meta[M_ITEM]
     for player in range(2):
         mine, theirs = (at, other) if player == 0 else (other, at)

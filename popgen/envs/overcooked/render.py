@@ -50,7 +50,7 @@ def _contents(env: OvercookedEnv, row: np.ndarray) -> dict[tuple[int, int], tupl
 def as_text(env: OvercookedEnv, row: np.ndarray) -> str:
     """The grid with seven characters a cell.
 
-    Players are an arrow, their number and what they hold (o onion, t tomato, d dish, [ooo] a soup in a dish); pots
+    SamplerPool are an arrow, their number and what they hold (o onion, t tomato, d dish, [ooo] a soup in a dish); pots
     show what is in them and the steps left to cook, or ! when the soup is ready.
     """
     layout, lying = env.layout, _contents(env, row)

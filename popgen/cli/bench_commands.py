@@ -1,0 +1,123 @@
+"""`popgen bench WHAT`: measured speed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from popgen.cli.arguments import Parser, add_command, at_least, numbers, positive
+from popgen.cli.compose import compose
+from popgen.cli.printing import OK, print_json, print_table
+from popgen.cli.training import before_ray
+
+if TYPE_CHECKING:
+    from popgen.config.run_config import RunConfig
+
+
+def add(commands: Any) -> None:
+    """`bench env`, `bench mappo` and `bench scale`."""
+    bench = commands.add_parser("bench", help="measure speed", description="Measure speed.")
+    kinds = bench.add_subparsers(title="what to measure", metavar="WHAT", required=True, parser_class=Parser)
+    env = add_command(
+        kinds,
+        "env",
+        bench_env,
+        "step plus all observations on one core, and the reference implementation in the same run",
+        "Keys of --json: steps_per_second, reference_steps_per_second and ratio (null without a reference), "
+        "step_only_per_second, env, num_envs, seconds.",
+    )
+    env.add_argument("--env", default="overcooked/cramped_room", help="registry name (%(default)s)")
+    env.add_argument("--envs", type=at_least(1), default=1024, help="environments stepped together (%(default)s)")
+    env.add_argument("--seconds", type=positive, default=2.0, help="time per measurement (%(default)s)")
+    mappo = add_command(
+        kinds,
+        "mappo",
+        bench_mappo,
+        "MAPPO's training of self-play on RLlib, end to end",
+        "Keys of --json: steps_per_second, steps_per_cpu_second, shares (sampling, pooling, gradients, rllib), env, "
+        "threads, runners, envs, iterations, steps, seconds, cpu_seconds.",
+    )
+    mappo.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
+    mappo.add_argument("--seconds", type=positive, default=20.0, help="time of the measurement (%(default)s)")
+    scale = add_command(
+        kinds,
+        "scale",
+        bench_scale,
+        "sampling and idle learners with several samplers, and a model of more nodes",
+        "Keys of --json: measured (samplers, steps_per_second, idle, model_steps_per_second), costs of a round, model "
+        "(samplers -> steps_per_second, idle_model, idle_agent), assumptions, cores, network_bytes_per_second, env.",
+    )
+    scale.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
+    scale.add_argument("--samplers", type=numbers, default=[1, 2, 4], metavar="1,2,...", help="how many (1,2,4)")
+    scale.add_argument("--seconds", type=positive, default=30.0, help="time per measurement (%(default)s)")
+
+
+def bench_env(args: argparse.Namespace) -> int:
+    """Environment steps a second."""
+    from popgen.pipelines.bench_env import bench_env as measure
+
+    result = measure(args.env, num_envs=args.envs, seconds=args.seconds)
+    if args.json:
+        print_json(result)
+    else:
+        ratio = "" if result["ratio"] is None else f"   {result['ratio']:,.0f} times the reference"
+        print(f"{args.env}: {result['steps_per_second']:,.0f} environment steps a second{ratio}")
+    return OK
+
+
+def bench_mappo(args: argparse.Namespace) -> int:
+    """Environment steps a second of MAPPO's training."""
+    config = _checked([*args.overrides, "method=mappo"])
+    from popgen.pipelines.bench_mappo import bench_mappo as measure
+
+    result = measure(config, seconds=args.seconds)
+    if args.json:
+        print_json(result)
+    else:
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in result["shares"].items())
+        print(f"{result['env']}: {result['steps_per_second']:,} environment steps a second end to end ({shares})")
+        print(f"{result['steps_per_cpu_second']:,} a second of processor time, {result['threads']} threads")
+    return OK
+
+
+def bench_scale(args: argparse.Namespace) -> int:
+    """Environment steps a second with several samplers."""
+    config = _checked([*args.overrides, "method=xpm_wm"])
+    from popgen.pipelines.bench_scale import bench_scale as measure
+
+    tell = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
+    result = measure(config, samplers=args.samplers, seconds=args.seconds, tell=tell)
+    if args.json:
+        print_json(result)
+    else:
+        _print_scale(result)
+    return OK
+
+
+def _checked(overrides: list[str]) -> RunConfig:
+    from popgen.config.run_config import RunConfig
+    from popgen.runs.preflight import preflight
+
+    config = RunConfig.parse(compose(overrides))
+    preflight(config)
+    before_ray(config.cluster.threads, config.cluster.address is None)
+    return config
+
+
+def _print_scale(result: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    measured = Table("samplers", "steps/s", "model's", "world model idle", "agent idle", title="measured here")
+    for row in result["measured"]:
+        idle = (f"{row['idle'][name]:.0%}" for name in ("model", "agent"))
+        rates = (f"{row[name]:,.0f}" for name in ("steps_per_second", "model_steps_per_second"))
+        measured.add_row(str(row["samplers"]), *rates, *idle)
+    print_table(measured)
+    model = Table("samplers", "steps/s", "world model idle", "agent idle", title="model: a core for each")
+    for nodes, row in result["model"].items():
+        model.add_row(nodes, f"{row['steps_per_second']:,.0f}", f"{row['idle_model']:.0%}", f"{row['idle_agent']:.0%}")
+    print_table(model)
+    costs = ", ".join(f"{name} {value:.3g}" for name, value in result["costs"].items())
+    print("\n".join([f"a round costs (s; steps; bytes): {costs}", *(f"assumed: {a}" for a in result["assumptions"])]))

@@ -1,0 +1,89 @@
+"""`popgen run`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from contextlib import closing
+from typing import Any
+
+from popgen.cli.arguments import add_command
+from popgen.cli.compose import compose, to_yaml
+from popgen.cli.printing import OK, figure_text, print_json, print_table
+from popgen.cli.training import before_ray
+
+
+def add(commands: Any) -> None:
+    """`run`."""
+    parser = add_command(
+        commands,
+        "run",
+        run,
+        "generate a population",
+        "Overrides are Hydra's: a group as in env=overcooked/cramped_room, method=xpm_wm, scale=laptop, "
+        "cluster=gpu_node or tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for "
+        "run.seed=1. The same run.id goes on where an interrupted run was. Exit codes: 0, 2 for an error told in one "
+        "line, 130 when interrupted. Keys of --json: run_id, run_dir, population (paths), members (how many), matrix "
+        "(mean and standard_error, row = seat 0, column = seat 1), ledger (environment steps by member and kind), "
+        "evaluation (as `evaluate --json`), files (the report's), seconds; with --dry-run the whole configuration.",
+    )
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="check everything, print the configuration, start nothing"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train a population and evaluate it, or say what would be done."""
+    from popgen.config.run_config import RunConfig
+    from popgen.progress import make_reporter
+    from popgen.runs.directory import named, run_folder
+    from popgen.runs.preflight import preflight
+    from popgen.runs.supervisor import guarded
+
+    config = RunConfig.parse(compose(args.overrides))
+    if args.own_process and not args.dry_run:
+        config = named(config)
+        if (code := guarded(run_folder(config), config.cluster.retries)) is not None:
+            return code
+    preflight(config)
+    if args.dry_run:
+        return _print_config(config.relevant(), args.json)
+    before_ray(config.cluster.threads, config.cluster.address is None)
+    from popgen.pipelines.population import run_population
+
+    with closing(make_reporter(quiet=args.quiet)) as reporter:
+        result = run_population(config, reporter=reporter)
+    if args.json:
+        print_json(result)
+    else:
+        _print_run(result)
+    return OK
+
+
+def _print_config(values: dict[str, Any], as_json: bool) -> int:
+    if as_json:
+        print_json(values)
+    else:
+        print(to_yaml(values), end="")
+    return OK
+
+
+def _print_run(result: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    evaluation = result["evaluation"]
+    members, matrix = evaluation["members"], evaluation["matrix"]
+    title = f"{evaluation['environment']['name']}: {evaluation['unit']} per episode (± standard error)"
+    table = Table("seat 0 \\ seat 1", *map(str, members), title=title)
+    for member, means, errors in zip(members, matrix["mean"], matrix["standard_error"], strict=True):
+        cells = ({"mean": mean, "standard_error": error} for mean, error in zip(means, errors, strict=True))
+        table.add_row(str(member), *map(figure_text, cells))
+    print_table(table)
+    beside = "".join(f"   beside {who} {figure_text(row['both'])}" for who, row in evaluation["beside"].items())
+    print(f"SP mean {figure_text(evaluation['sp'])}   XP mean {figure_text(evaluation['xp'])}{beside}")
+    for who, row in result["ledger"].items():
+        kinds = ", ".join(f"{kind} {steps:,}" for kind, steps in row.items() if steps and kind != "total")
+        print(f"environment steps, {'all' if who == 'total' else f'member {who}'}: {kinds}")
+    print(f"time: {result['seconds'] / 60:.1f} minutes")
+    print(f"population: {result['population']}   ledger, checkpoints and reports: {result['run_dir']}")

@@ -1,0 +1,1 @@
+"""MAPPO on RLlib, and the baselines on it."""

@@ -1,0 +1,270 @@
+"""Stepping batched environments: one slot per environment of every group, many members acting in one call each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from popgen.envs.contract import BatchedEnv
+from popgen.envs.reward import training_reward
+from popgen.methods.mappo.training_job import Group
+from popgen.types import Kind
+
+Actor = Callable[[Tensor, Tensor], Tensor]
+"""(R, *view.shape) observations and (R, P) one-hot seats -> (R, A) logits."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """One whole finished episode: its group (index in the rollout), its score, and its undiscounted training reward."""
+
+    group: int
+    score: float
+    reward: float
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """T steps of N environments, in the columns of `groups` one after the other.
+
+    Attributes:
+        groups: who plays; `envs` columns each.
+        obs: (T + 1, N, P, *view.shape); row T is what follows the last step, after any reset.
+        final_at: (K, 2) int, step and column of every truncation.
+        final: (K, P, *view.shape), the observation that the truncated episode ended with, before the reset.
+        actions: (T, N, P) uint8.
+        log_prob: (T, N, P) float32, of the actions under the policies that took them.
+        reward: (T, N) float32, the joint training reward (`popgen.envs.reward`).
+        terminated, truncated: (T, N) bool.
+        seats: (T, N, P) int32, the member who acted.
+        episodes: those that ended, in order.
+    """
+
+    groups: tuple[Group, ...]
+    obs: np.ndarray
+    final_at: np.ndarray
+    final: np.ndarray
+    actions: np.ndarray
+    log_prob: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    seats: np.ndarray
+    episodes: tuple[Ended, ...]
+
+    @property
+    def steps(self) -> int:
+        """Environment steps: T * N."""
+        return int(self.reward.size)
+
+    def columns(self, group: int) -> slice:
+        """The columns of a group."""
+        start = sum(g.envs for g in self.groups[:group])
+        return slice(start, start + self.groups[group].envs)
+
+
+class SlotPool:
+    """Running episodes of all groups; those of a group that is not played wait where they are.
+
+    Args:
+        make: (number, seed) -> environments.
+        groups: with the environments that this pool steps of each; may be 0.
+        view: what the members look at.
+        seed: of environments, actions and switch points.
+        stagger: spread the first ends of episodes over the horizon.
+        once: tell of the first episode of every environment alone. Of all that end within a given time, short ones are
+            more than their share.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int, int], BatchedEnv],
+        groups: Sequence[Group],
+        view: str,
+        *,
+        seed: int,
+        stagger: bool = True,
+        once: bool = False,
+    ) -> None:
+        self.make, self.groups, self.view, self.once = make, tuple(groups), view, once
+        self._envs: dict[int, BatchedEnv] = {}
+        self._rng = np.random.default_rng(seed)
+        self._draws = torch.Generator().manual_seed(seed)
+        count = sum(group.envs for group in groups)
+        env = self._env(max(1, count))
+        env.reset(seed=seed)
+        self.spec = env.spec
+        self.age = np.zeros(count, np.int64)
+        if stagger and count:
+            spread = [np.arange(group.envs) * self.spec.horizon // max(1, group.envs) for group in groups]
+            self.age[:] = np.concatenate(spread)
+            env.set_time(self.age)
+        self.states = env.get_state()[:count]
+        self.generator = env.generator_state()
+        self.whole = self.age == 0
+        self.score, self.reward = np.zeros(count), np.zeros(count)
+        self.switch = self._rng.integers(0, self.spec.horizon, count)
+
+    def play(self, active: Sequence[int], steps: int, actors: Mapping[int, Actor]) -> Rollout:
+        """`steps` steps in the environments of the groups `active`, acting with `actors` by member."""
+        run = _Run(self, [index for index in active if self.groups[index].envs], steps)
+        with torch.inference_mode():
+            for t in range(steps):
+                run.step(t, actors)
+        return run.finish()
+
+    def rows(self, group: int) -> np.ndarray:
+        """Slots of a group."""
+        start = sum(g.envs for g in self.groups[:group])
+        return np.arange(start, start + self.groups[group].envs)
+
+    def state(self) -> dict[str, Any]:
+        """Everything to go on from exactly here, but for groups and actors."""
+        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
+        return {
+            **arrays,
+            "generator": self.generator,
+            "rng": self._rng.bit_generator.state,
+            "draws": self._draws.get_state().numpy().copy(),
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state()` of a pool of the same groups."""
+        for name in _ARRAYS:
+            getattr(self, name)[:] = state[name]
+        self.generator = state["generator"]
+        self._rng.bit_generator.state = state["rng"]
+        self._draws.set_state(torch.from_numpy(np.array(state["draws"])))
+
+    def _env(self, count: int) -> BatchedEnv:
+        if count not in self._envs:
+            self._envs[count] = self.make(count, 0)
+        return self._envs[count]
+
+    def draw(self, logits: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (R,) of logits (R, A), by the maximum of Gumbel-perturbed ones, and their log-probabilities (R,)."""
+        log_probs = torch.log_softmax(logits, -1)
+        noise = torch.empty_like(log_probs).exponential_(generator=self._draws)
+        actions = (log_probs - noise.log()).argmax(-1, keepdim=True)
+        return actions.squeeze(-1), log_probs.gather(-1, actions).squeeze(-1)
+
+    def switches(self, count: int) -> np.ndarray:
+        """Steps at which new episodes of mixed play go over to self-play, even over the horizon."""
+        return self._rng.integers(0, self.spec.horizon, count)
+
+
+_ARRAYS = ("states", "age", "whole", "score", "reward", "switch")
+
+
+class _Run:
+    """One call of `SlotPool.play`."""
+
+    def __init__(self, pool: SlotPool, active: list[int], steps: int) -> None:
+        self.pool, self.groups = pool, tuple(pool.groups[index] for index in active)
+        self.rows = np.concatenate([pool.rows(index) for index in active])
+        count, spec = len(self.rows), pool.spec
+        self.env = pool._env(count)
+        self.env.set_state(pool.states[self.rows])
+        self.env.load_generator_state(pool.generator)
+        self.group = np.repeat(np.arange(len(active)), [group.envs for group in self.groups])
+        self.team = np.array([group.members for group in self.groups], np.int32)[self.group]
+        self.owner = np.array([group.owner for group in self.groups], np.int32)[self.group]
+        self.mixed = np.array([group.kind is Kind.MP for group in self.groups])[self.group]
+        for name in ("age", "whole", "score", "reward", "switch"):
+            setattr(self, name, getattr(pool, name)[self.rows])
+        view = spec.views[pool.view]
+        shape = (count, spec.num_players, *view.shape)
+        self.obs = np.empty((steps + 1, *shape), view.dtype)
+        self.obs[0] = self.env.observe(pool.view)
+        self.actions = np.empty((steps, count, spec.num_players), np.uint8)
+        self.log_prob = np.empty(self.actions.shape, np.float32)
+        self.seats = np.empty(self.actions.shape, np.int32)
+        self.rewards = np.empty((steps, count), np.float32)
+        self.terminated, self.truncated = np.empty((steps, count), bool), np.empty((steps, count), bool)
+        self.final_at: list[np.ndarray] = []
+        self.final: list[np.ndarray] = []
+        self.episodes: list[Ended] = []
+        self.one_hot = torch.eye(spec.num_players).repeat(count, 1)
+        self.now = np.zeros((0, 0), np.int32)
+        self.acting: list[tuple[int, Tensor | None, Tensor]] = []
+
+    def step(self, t: int, actors: Mapping[int, Actor]) -> None:
+        """One step of all environments."""
+        self._seat()
+        flat = torch.from_numpy(self.obs[t]).flatten(0, 1)
+        parts = [
+            (index, actors[member](flat if index is None else flat[index], seats))
+            for member, index, seats in self.acting
+        ]
+        logits = parts[0][1]
+        if parts[0][0] is not None:
+            logits = torch.empty(len(flat), logits.shape[-1])
+            for index, part in parts:
+                logits[index] = part
+        actions, log_prob = self.pool.draw(logits)
+        self.seats[t] = self.now
+        self.actions[t] = actions.view(self.now.shape).numpy()
+        self.log_prob[t] = log_prob.view(self.now.shape).numpy()
+        result = self.env.step(self.actions[t])
+        self.rewards[t] = training_reward(self.pool.spec, result)
+        self.terminated[t], self.truncated[t] = result.terminated, result.truncated
+        self.score += result.score
+        self.reward += self.rewards[t]
+        self.age += 1
+        self.obs[t + 1] = self.env.observe(self.pool.view)
+        if result.done.any():
+            self._end(t, np.flatnonzero(result.done))
+
+    def _seat(self) -> None:
+        """Who acts now; the members' rows are found again only where mixed play has changed them."""
+        switched = self.mixed & (self.age >= self.switch)
+        now = np.where(switched[:, None], self.owner[:, None], self.match)
+        if now.shape == self.now.shape and (now == self.now).all():
+            return
+        self.now = now
+        flat = now.reshape(-1)
+        members = np.unique(flat)
+        if len(members) == 1:
+            self.acting = [(int(members[0]), None, self.one_hot)]
+            return
+        found = [(int(member), torch.from_numpy(np.flatnonzero(flat == member))) for member in members]
+        self.acting = [(member, index, self.one_hot[index]) for member, index in found]
+
+    def _end(self, t: int, columns: np.ndarray) -> None:
+        cut = columns[self.truncated[t, columns]]
+        self.final_at.append(np.stack([np.full(len(cut), t), cut], -1))
+        self.final.append(self.obs[t + 1, cut])
+        for column in columns[self.whole[columns]]:
+            self.episodes.append(Ended(int(self.group[column]), float(self.score[column]), float(self.reward[column])))
+        self.env.reset(indices=columns)
+        self.obs[t + 1, columns] = self.env.encode(self.env.get_state(columns), self.pool.view)
+        self.age[columns], self.score[columns], self.reward[columns] = 0, 0.0, 0.0
+        self.whole[columns] = not self.pool.once
+        self.switch[columns] = self.pool.switches(len(columns))
+
+    def finish(self) -> Rollout:
+        """Put the running episodes back into the pool."""
+        pool = self.pool
+        pool.states[self.rows] = self.env.get_state()
+        pool.generator = self.env.generator_state()
+        for name in ("age", "whole", "score", "reward", "switch"):
+            getattr(pool, name)[self.rows] = getattr(self, name)
+        none = np.zeros((0, *self.obs.shape[2:]), self.obs.dtype)
+        return Rollout(
+            groups=self.groups,
+            obs=self.obs,
+            final_at=np.concatenate([np.zeros((0, 2), np.int64), *self.final_at]),
+            final=np.concatenate([none, *self.final]),
+            actions=self.actions,
+            log_prob=self.log_prob,
+            reward=self.rewards,
+            terminated=self.terminated,
+            truncated=self.truncated,
+            seats=self.seats,
+            episodes=tuple(self.episodes),
+        )

@@ -1,0 +1,1 @@
+"""XPM-Sim: cross-play minimisation on trajectories of the exact simulator."""

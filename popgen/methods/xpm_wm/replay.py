@@ -1,0 +1,254 @@
+"""B_SP and B_XP: a ring of compact environment states; observations are encoded when a batch is drawn.
+
+A row is one transition (s_t, a_t, e_{t+1}); where an episode terminated, one more row holds the terminal state.
+Rows of one environment lie contiguously in a *stream*; a window never crosses streams.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from popgen.envs.contract import BatchedEnv
+from popgen.types import Kind, Segment
+
+KIND_CODE = {kind: code for code, kind in enumerate(Kind)}
+
+
+@dataclass(frozen=True)
+class Windows:
+    """N windows of L states, batch first; everything at t belongs to the state at t (see docs/design.md).
+
+    obs (N, L, P, *shape) in the view's dtype; actions (N, L, P) int64, the joint action that led to the state;
+    events (N, L, P, E) uint8 that it caused; is_first (N, L) bool; terminal (N, L) bool; partner (N,) int64,
+    the other member of a cross-play window, 0 elsewhere; kind (N,) int64, a KIND_CODE; chosen (N,) bool: drawn for an
+    event that it contains.
+    """
+
+    obs: np.ndarray
+    actions: np.ndarray
+    events: np.ndarray
+    is_first: np.ndarray
+    terminal: np.ndarray
+    partner: np.ndarray
+    kind: np.ndarray
+    chosen: np.ndarray
+
+
+@dataclass(frozen=True)
+class Query:
+    """Which rows to draw from; None means no condition.
+
+    owner: member during whose training the row was collected, with `owner_is` "equal" or "below".
+    partner: the other member of cross-play rows.
+    recent: only this last share of the rows that match.
+    last: only so many of the last rows that match.
+    """
+
+    owner: int | None = None
+    owner_is: str = "equal"
+    kind: Kind | None = None
+    partner: int | None = None
+    recent: float = 1.0
+    last: int | None = None
+
+
+def by_event(batch: int, event_fraction: float) -> int:
+    """How many of a batch of windows are chosen for an event: the first ones."""
+    return int(round(batch * event_fraction))
+
+
+class Replay:
+    """A ring buffer of transitions.
+
+    Args:
+        env: encodes states; its own episode is not touched.
+        capacity: rows; each takes the bytes of a state and 2 + P * E + 15 more.
+        seed: of the sampling generator.
+    """
+
+    COLUMNS = ("states", "actions", "events", "first", "terminal", "stream", "owner", "partner", "kind")
+
+    def __init__(self, env: BatchedEnv, capacity: int, seed: int) -> None:
+        spec = env.spec
+        self.env, self.capacity = env, capacity
+        self.rng = np.random.default_rng(seed)
+        self.size = self.head = self.streams = self.added = 0
+        self._cache: dict[Any, np.ndarray] = {}
+        self.states = np.zeros((capacity, spec.state_size), spec.state_dtype)
+        self.actions = np.zeros((capacity, 2), np.uint8)
+        self.events = np.zeros((capacity, 2, spec.num_events), np.uint8)
+        self.first = np.zeros(capacity, bool)
+        self.terminal = np.zeros(capacity, bool)
+        self.stream = np.full(capacity, -1, np.int64)
+        self.owner = np.zeros(capacity, np.int16)
+        self.partner = np.zeros(capacity, np.int16)
+        self.kind = np.zeros(capacity, np.uint8)
+
+    def add(self, segment: Segment, owner: int) -> None:
+        """Store every environment of a segment as a stream of its own."""
+        pair = segment.members
+        partner = 0 if pair[0] == pair[1] else min(pair) if max(pair) == owner else max(pair)
+        for column in range(segment.reward.shape[1]):
+            self._add_stream(segment, column, owner, partner)
+        self._cache.clear()
+
+    def _add_stream(self, segment: Segment, column: int, owner: int, partner: int) -> None:
+        ended = segment.terminated[:, column]
+        order = np.concatenate([np.arange(len(ended)), np.flatnonzero(ended) + 0.5]).argsort(kind="stable")
+        source = np.concatenate([np.arange(len(ended)), np.flatnonzero(ended)])[order]
+        arrival = order >= len(ended)
+        rows = self._reserve(len(source))
+        self.states[rows] = segment.states[source, column]
+        self.states[rows[arrival]] = segment.next_states[source[arrival], column]
+        self.actions[rows] = segment.actions[source, column]
+        self.events[rows] = segment.events[source, column]
+        self.events[rows[arrival]] = 0
+        done = (segment.terminated | segment.truncated)[source, column]
+        after_done = np.concatenate([[True], (done & (arrival | ~segment.terminated[source, column]))[:-1]])
+        self.first[rows] = after_done
+        self.terminal[rows] = arrival
+        self.stream[rows] = self.streams
+        self.owner[rows], self.partner[rows] = owner, partner
+        self.kind[rows] = KIND_CODE[segment.kind]
+        self.streams += 1
+        self.added += len(rows)
+
+    def _reserve(self, count: int) -> np.ndarray:
+        if count > self.capacity:
+            raise ValueError(f"a stream of {count} rows does not fit a replay of {self.capacity}")
+        if self.head + count > self.capacity:
+            self.stream[self.head : self.size] = -1
+            self.head = 0
+        rows = np.arange(self.head, self.head + count)
+        self.head += count
+        self.size = max(self.size, self.head)
+        return rows
+
+    def rows(self, query: Query, event: int | None = None) -> np.ndarray:
+        """Row numbers that match (and at which a window can show `event`), oldest first; cached until the next add."""
+        key = (query, event)
+        if key not in self._cache:
+            self._cache[key] = self._matching(query) if event is None else self._showing(self.rows(query), event)
+        return self._cache[key]
+
+    def _matching(self, query: Query) -> np.ndarray:
+        match = self.stream[: self.size] >= 0
+        if query.owner is not None:
+            owner = self.owner[: self.size]
+            match &= owner == query.owner if query.owner_is == "equal" else owner < query.owner
+        if query.kind is not None:
+            match &= self.kind[: self.size] == KIND_CODE[query.kind]
+        if query.partner is not None:
+            match &= self.partner[: self.size] == query.partner
+        found = np.flatnonzero(match)
+        wrapped = int(np.searchsorted(found, self.head))  # rows from the head on are the ring's oldest
+        found = np.concatenate([found[wrapped:], found[:wrapped]])
+        kept = int(np.ceil(len(found) * query.recent))
+        return found[len(found) - (kept if query.last is None else min(kept, query.last)) :]
+
+    def _showing(self, found: np.ndarray, event: int) -> np.ndarray:
+        """Those of the rows at which a window can show the event."""
+        found = found[self.events[found, :, event].any(1)]
+        # A window shows an event at the state it led to, which is not stored where an episode was cut.
+        return found[self._whole(found, 2) & ~self.first[(found + 1) % self.capacity]]
+
+    def sample(
+        self, batch: int, length: int, query: Query, *, event_fraction: float = 0.0, turn: int = 0
+    ) -> np.ndarray:
+        """First rows of `batch` windows of `length`; a share contains an event, the types in turn.
+
+        Raises:
+            LookupError: no window of that length matches.
+        """
+        starts = self._draw(self.rows(query), batch, length, offset=0)
+        for slot in range(by_event(batch, event_fraction)):
+            event = (turn + slot) % self.env.spec.num_events
+            found = self.rows(query, event)
+            if len(found):
+                offset = int(self.rng.integers(0, length - 1))
+                picked = self._draw(found, 1, length, offset=offset, strict=False)
+                if len(picked):
+                    starts[slot] = picked[0]
+        return starts
+
+    def before_events(self, batch: int, length: int, query: Query, events: list[int], reach: int) -> np.ndarray:
+        """First rows of windows whose last state lies up to `reach` steps before one of the events, in its episode."""
+        found = (
+            np.unique(np.concatenate([self.rows(query, event) for event in events])) if events else np.array([], int)
+        )
+        if not len(found):
+            return self.sample(batch, length, query)
+        lead = self.rng.integers(0, reach, size=batch * 4)
+        picked = found[self.rng.integers(0, len(found), size=batch * 4)]
+        last, episode = picked - lead, np.cumsum(self.first[: self.size])
+        same = (self.stream[last] == self.stream[picked]) & (episode[last] == episode[picked])
+        starts = (last - (length - 1))[same]
+        starts = starts[self._whole(starts, length)][:batch]
+        missing = batch - len(starts)
+        return np.concatenate([starts, self.sample(missing, length, query)]) if missing else starts
+
+    def _draw(self, found: np.ndarray, batch: int, length: int, *, offset: int, strict: bool = True) -> np.ndarray:
+        kept: list[np.ndarray] = []
+        missing = batch
+        for _ in range(50):
+            if missing <= 0 or not len(found):
+                break
+            starts = found[self.rng.integers(0, len(found), size=2 * missing + 8)] - offset
+            starts = starts[self._whole(starts, length)][:missing]
+            kept.append(starts)
+            missing -= len(starts)
+        if missing and strict:
+            raise LookupError(f"the replay has no window of {length} states that matches")
+        return np.concatenate(kept) if kept else np.array([], np.int64)
+
+    def _whole(self, starts: np.ndarray, length: int) -> np.ndarray:
+        inside = (starts >= 0) & (starts + length <= self.size)
+        first, last = self.stream[np.where(inside, starts, 0)], self.stream[np.where(inside, starts + length - 1, 0)]
+        return inside & (first == last) & (first >= 0)
+
+    def windows(self, starts: np.ndarray, length: int, view: str, chosen: np.ndarray | None = None) -> Windows:
+        """Encode the windows that begin at rows `starts` (N,), of which `chosen` (N,) were drawn for an event."""
+        index = starts[:, None] + np.arange(length)
+        before = np.maximum(index - 1, 0)
+        is_first = self.first[index].copy()
+        is_first[:, 0] = True
+        return Windows(
+            obs=self.env.encode(self.states[index], view),
+            actions=self.actions[before].astype(np.int64),
+            events=self.events[before],
+            is_first=is_first,
+            terminal=self.terminal[index],
+            partner=self.partner[starts].astype(np.int64),
+            kind=self.kind[starts].astype(np.int64),
+            chosen=np.zeros(len(starts), bool) if chosen is None else chosen,
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Everything needed to go on: arrays of the filled part, counters and the generator (JSON-able)."""
+        arrays = {name: getattr(self, name)[: self.size].copy() for name in self.COLUMNS}
+        counters = {
+            "head": self.head,
+            "streams": self.streams,
+            "added": self.added,
+            "rng": self.rng.bit_generator.state,
+        }
+        return {"arrays": arrays, "counters": counters}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Undo nothing, take over `state()` of another replay.
+
+        Raises:
+            ValueError: it holds more rows than this one's capacity.
+        """
+        arrays, counters = state["arrays"], state["counters"]
+        if len(arrays["stream"]) > self.capacity:
+            raise ValueError(f"{len(arrays['stream'])} rows do not fit a replay of {self.capacity}")
+        self.size = len(arrays["stream"])
+        for name in self.COLUMNS:
+            getattr(self, name)[: self.size] = arrays[name]
+        self.head, self.streams, self.added = (int(counters[name]) for name in ("head", "streams", "added"))
+        self.rng.bit_generator.state = counters["rng"]
+        self._cache.clear()

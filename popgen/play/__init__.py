@@ -1,0 +1,1 @@
+"""Playing: who sits where, rollouts, episodes, partners' strength."""

@@ -1,0 +1,90 @@
+"""Who sits where in a batch: calls every policy once a step, on all rows in which it plays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from popgen.play.policy import Policy, Remembering
+from popgen.shapes import check
+
+
+class Seating:
+    """B matches drawn from K policies, and the memory that acting needs (previous actions, first steps).
+
+    A policy in both seats of a row is called once for that row. The caller steps the environment, resets the
+    rows that are done and says so through `ended`.
+
+    Args:
+        policies: K distinct policy objects.
+        seats: (B, P) int, the policy's index for each row and seat.
+
+    Raises:
+        ValueError: `seats` of a wrong shape or range, or one policy object listed twice.
+    """
+
+    def __init__(self, policies: Sequence[Policy], seats: np.ndarray) -> None:
+        self.seats = np.asarray(seats)
+        check(self.seats, (None, None), "seats")
+        if len({id(policy) for policy in policies}) != len(policies):
+            raise ValueError("policies: one object is listed twice; its memory can serve one set of rows only")
+        if self.seats.size == 0 or self.seats.min() < 0 or self.seats.max() >= len(policies):
+            raise ValueError(f"seats: need at least one row and indices in [0, {len(policies)})")
+        self.policies = list(policies)
+        # A policy that sits in no row is left alone.
+        rows = ((k, np.flatnonzero((self.seats == k).any(1))) for k in range(len(policies)))
+        self._rows = [(k, members) for k, members in rows if len(members)]
+        self._actions = np.zeros(self.seats.shape, np.uint8)
+        self._first = np.ones(len(self.seats), bool)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views that `act` needs."""
+        return tuple(sorted({self.policies[k].view for k, _ in self._rows}))
+
+    @property
+    def is_first(self) -> np.ndarray:
+        """(B,) bool: the row's next action is the first of an episode."""
+        return self._first.copy()
+
+    def reset(self, seed: int) -> None:
+        """Fresh episodes in all rows; every policy's generator is derived from `seed`."""
+        seeds = np.random.SeedSequence(seed).generate_state(len(self.policies))
+        for k, rows in self._rows:
+            self.policies[k].reset(len(rows), int(seeds[k] >> 1))
+        self._actions[:], self._first[:] = 0, True
+
+    def act(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Joint actions (B, P) uint8 on the current observations, view name -> (B, P, *view.shape)."""
+        actions = np.empty_like(self._actions)
+        for k, rows in self._rows:
+            policy, obs = self.policies[k], observations[self.policies[k].view]
+            check(obs, (len(self.seats), self.seats.shape[1], *obs.shape[2:]), f"observations[{policy.view!r}]")
+            chosen = np.asarray(policy.act(obs[rows], self._actions[rows], self._first[rows]))
+            check(chosen, (len(rows), self.seats.shape[1]), f"actions of policy {k}")
+            own = self.seats[rows] == k
+            part = actions[rows]
+            part[own] = chosen[own]
+            actions[rows] = part
+        self._actions, self._first = actions, np.zeros(len(actions), bool)
+        return actions.copy()
+
+    def ended(self, done: np.ndarray) -> None:
+        """Mark the rows (B,) bool that were reset: their next step is the first of an episode."""
+        self._first = np.asarray(done, bool).copy()
+
+    def state(self) -> dict[str, Any]:
+        """Everything to go on from exactly here: last actions, first steps and the policies' memories."""
+        memories = {str(k): self.policies[k].memory() for k in self._remembering()}
+        return {"actions": self._actions.copy(), "first": self._first.copy(), "memories": memories}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state()` of the same seats and policies."""
+        self._actions, self._first = np.array(state["actions"]), np.array(state["first"])
+        for k in self._remembering():
+            self.policies[k].load_memory(state["memories"][str(k)])
+
+    def _remembering(self) -> list[int]:
+        return [k for k, _ in self._rows if isinstance(self.policies[k], Remembering)]

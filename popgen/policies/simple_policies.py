@@ -1,0 +1,103 @@
+"""Policies that learn nothing: uniform-random and idle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from popgen.envs.contract import EnvSpec
+
+
+def _no_weights(weights: Mapping[str, np.ndarray]) -> None:
+    if weights:
+        raise ValueError(f"expected no tensors, got {', '.join(sorted(weights))}")
+
+
+class RandomPolicy:
+    """Draws every action independently, uniformly or with given probabilities.
+
+    Args:
+        num_actions: A.
+        probabilities: A numbers that are not negative and sum to 1; None for uniform.
+
+    Raises:
+        ValueError: probabilities of a wrong length, negative or not summing to 1.
+    """
+
+    kind: ClassVar[str] = "random"
+
+    def __init__(self, num_actions: int, probabilities: Sequence[float] | None = None) -> None:
+        self.view = "features"
+        self.num_actions = int(num_actions)
+        self.probabilities = None if probabilities is None else [float(p) for p in probabilities]
+        if self.probabilities is not None:
+            given = np.asarray(self.probabilities)
+            if given.shape != (self.num_actions,) or not (given >= 0).all() or abs(given.sum() - 1.0) > 1e-6:
+                raise ValueError(f"probabilities must be {self.num_actions} non-negative numbers that sum to 1")
+        self._rng = np.random.default_rng(0)
+
+    def reset(self, batch: int, seed: int) -> None:
+        """Restart the generator; there is no memory."""
+        self._rng = np.random.default_rng(seed)
+
+    def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+        """Draw (B, P) actions; the observation counts for its batch size only."""
+        size = obs.shape[:2]
+        if self.probabilities is None:
+            return self._rng.integers(0, self.num_actions, size, dtype=np.uint8)
+        bounds = np.cumsum(self.probabilities)[:-1]  # the last bound may round to below 1
+        return np.searchsorted(bounds, self._rng.random(size), side="right").astype(np.uint8)
+
+    def config(self) -> dict[str, Any]:
+        """The action probabilities, None for uniform."""
+        return {"probabilities": self.probabilities}
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Nothing is learned."""
+        return {}
+
+    @classmethod
+    def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> Self:
+        """See `Policy.from_parts`."""
+        _no_weights(weights)
+        return cls(spec.num_actions, **config)
+
+
+class IdlePolicy:
+    """Always plays one action, by default the environment's `stay`.
+
+    Raises:
+        ValueError: the environment has no action of that name.
+    """
+
+    kind: ClassVar[str] = "idle"
+
+    def __init__(self, action_names: Sequence[str], action: str = "stay") -> None:
+        if action not in action_names:
+            raise ValueError(f"no action {action!r} among {', '.join(action_names)}")
+        self.view = "features"
+        self.action = action
+        self._index = list(action_names).index(action)
+
+    def reset(self, batch: int, seed: int) -> None:
+        """There is nothing to forget."""
+
+    def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+        """(B, P) times the same action."""
+        return np.full(obs.shape[:2], self._index, np.uint8)
+
+    def config(self) -> dict[str, Any]:
+        """The name of the action."""
+        return {"action": self.action}
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Nothing is learned."""
+        return {}
+
+    @classmethod
+    def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> Self:
+        """See `Policy.from_parts`."""
+        _no_weights(weights)
+        return cls(spec.action_names, **config)

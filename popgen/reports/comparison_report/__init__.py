@@ -1,0 +1,81 @@
+"""A comparison of runs as JSON, CSV, Markdown, tables for the terminal and charts.
+
+Keys of the JSON object (`comparison.json`); null stands for what is unknown:
+
+    format, format_version   "popgen-comparison", 1
+    agents                   M up to which costs are extrapolated
+    runs                     label, method, environment, cooking, fingerprint, seed, scale, path, members, adopted,
+                             attempts, steps (by kind), real_steps, simulated_steps, evaluation_steps, lost_steps,
+                             seconds
+    costs                    one per run and M: label, environment, seed, agents, measured, rule, steps (by kind,
+                             cumulative), real_steps, simulated_steps, seconds
+    scores                   one per label and environment: seeds, sp and xp (mean, low, high over seeds), gap, beside
+                             (random, idle), paper (sp, xp or null)
+    quality                  thresholds (environment -> sp, xp or null), members (label, environment, seed, member,
+                             steps or null, simulated, spent, known), agents (label, environment, seed, agents,
+                             steps, simulated, reached, lower_bound)
+    paper                    environment -> method -> sp, xp: all that the paper has on these environments
+    budgets                  both readings of the baselines' budget: source (`paper` or a run), method, environment,
+                             agents, reading, budget, steps (by kind), total, ratio (over the paper's XPM-WM)
+    notes                    what a reader must know, in sentences
+
+`contents` makes that object, `tables` its CSV files and tables, `figures` the charts.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from popgen.errors import UserError
+from popgen.reports.comparison_report.charts import draw
+from popgen.reports.comparison_report.contents import Comparison, chosen_thresholds, to_dict
+from popgen.reports.comparison_report.tables import (
+    BUDGET_FIELDS,
+    COST_FIELDS,
+    QUALITY_FIELDS,
+    budgets_csv,
+    costs_csv,
+    quality_csv,
+    to_markdown,
+    to_tables,
+)
+
+__all__ = [
+    "BUDGET_FIELDS",
+    "COST_FIELDS",
+    "QUALITY_FIELDS",
+    "Comparison",
+    "budgets_csv",
+    "chosen_thresholds",
+    "costs_csv",
+    "draw",
+    "quality_csv",
+    "to_dict",
+    "to_markdown",
+    "to_tables",
+    "write_report",
+]
+
+
+def write_report(comparison: Comparison, folder: str | Path) -> dict[str, Path]:
+    """Write comparison.json and .md, costs.csv, quality.csv, budgets.csv and the charts; gives the paths by name.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    folder, report = Path(folder), to_dict(comparison)
+    texts = {
+        "comparison.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
+        "comparison.md": to_markdown(report),
+        "costs.csv": costs_csv(report),
+        "quality.csv": quality_csv(report),
+        "budgets.csv": budgets_csv(report),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        return {name: folder / name for name in texts} | draw(comparison, folder)
+    except OSError as error:
+        raise UserError(str(folder), f"cannot be written: {error.strerror}", "choose another folder") from error

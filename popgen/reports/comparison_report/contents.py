@@ -1,0 +1,205 @@
+"""What a comparison tells: the JSON object of the package's docstring."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from popgen.errors import UserError
+from popgen.reports import paper_figures as paper
+from popgen.reports.comparison import (
+    KINDS,
+    Budget,
+    Group,
+    Thresholds,
+    budgets,
+    costs,
+    default_thresholds,
+    quality,
+    quality_costs,
+)
+from popgen.reports.run_record import REAL, RunRecord
+from popgen.types import Kind
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is compared, and how.
+
+    Attributes:
+        groups: from `group_runs`.
+        agents: costs are carried on to this many.
+        thresholds: of equal quality by environment; an environment without is left out of it.
+    """
+
+    groups: tuple[Group, ...]
+    agents: int
+    thresholds: Mapping[str, Thresholds]
+
+    @property
+    def environments(self) -> list[str]:
+        """Names, in order."""
+        return list(dict.fromkeys(group.environment for group in self.groups))
+
+
+def chosen_thresholds(groups: Sequence[Group], sp: float | None, xp: float | None) -> dict[str, Thresholds]:
+    """Thresholds by environment: those given, else the defaults where there are any.
+
+    Raises:
+        UserError: only one of the two was given for an environment that has no defaults.
+    """
+    found: dict[str, Thresholds] = {}
+    for name in dict.fromkeys(group.environment for group in groups):
+        base = default_thresholds(name)
+        if base is None and (sp is None) != (xp is None):
+            missing = "--sp" if sp is None else "--xp"
+            raise UserError(missing, f"the paper has no dishes for {name} to take it from", "give both --sp and --xp")
+        if base is None and (sp is None or xp is None):
+            continue
+        first = sp if sp is not None else base.sp if base else 0.0
+        second = xp if xp is not None else base.xp if base else 0.0
+        found[name] = Thresholds(first, second)
+    return found
+
+
+def to_dict(comparison: Comparison) -> dict[str, Any]:
+    """The JSON object of the package's docstring."""
+    return {
+        "format": "popgen-comparison",
+        "format_version": 1,
+        "agents": comparison.agents,
+        "runs": [_run(group, run) for group in comparison.groups for run in group.runs],
+        "costs": [row for group in comparison.groups for row in _costs(group, comparison.agents)],
+        "scores": [_scores(group) for group in comparison.groups],
+        "quality": _quality(comparison),
+        "paper": {
+            name: {method: {"sp": row.sp, "xp": row.xp} for method, row in paper.SCORES.get(name, {}).items()}
+            for name in comparison.environments
+        },
+        "budgets": [_budget(budget) for budget in budgets(comparison.groups, comparison.agents)],
+        "notes": _notes(comparison),
+    }
+
+
+def _run(group: Group, run: RunRecord) -> dict[str, Any]:
+    steps = {kind: sum(m.steps.get(kind, 0) for m in run.members) for kind in KINDS}
+    times = [m.seconds for m in run.members]
+    return {
+        "label": group.label,
+        "method": group.method,
+        "environment": group.environment,
+        "cooking": run.environment.cooking,
+        "fingerprint": run.environment.fingerprint,
+        "seed": run.seed,
+        "scale": run.scale,
+        "path": str(run.path),
+        "members": len(run.members),
+        "adopted": sum(m.adopted for m in run.members),
+        "attempts": run.attempts,
+        "steps": steps,
+        "real_steps": sum(steps[str(kind)] for kind in REAL),
+        "simulated_steps": steps[str(Kind.SIMULATED)],
+        "evaluation_steps": run.evaluation_steps,
+        "lost_steps": run.lost_steps,
+        "seconds": None if None in times else round(sum(times), 1),
+    }
+
+
+def _costs(group: Group, agents: int) -> Iterable[dict[str, Any]]:
+    for run in group.runs:
+        for cost in costs(run, agents):
+            yield {
+                "label": group.label,
+                "environment": group.environment,
+                "method": group.method,
+                "seed": run.seed,
+                "run": run.run_id,
+                "agents": cost.agents,
+                "measured": cost.measured,
+                "rule": cost.rule,
+                "steps": {str(kind): round(cost.steps[str(kind)]) for kind in REAL},
+                "real_steps": round(cost.real),
+                "simulated_steps": round(cost.simulated),
+                "seconds": None if cost.seconds is None else round(cost.seconds, 1),
+            }
+
+
+def _scores(group: Group) -> dict[str, Any]:
+    """Means over seeds of each run's own SP/XP report."""
+    reports = [run.scores for run in group.runs]
+    sp, xp = (_spread([report[name]["mean"] for report in reports]) for name in ("sp", "xp"))
+    theirs = paper.scores(group.environment, group.method)
+    apart = None if sp["mean"] is None or xp["mean"] is None else sp["mean"] - xp["mean"]
+    return {
+        "label": group.label,
+        "environment": group.environment,
+        "unit": reports[0]["unit"],
+        "seeds": [run.seed for run in group.runs],
+        "members": [len(run.members) for run in group.runs],
+        "sp": sp,
+        "xp": xp,
+        "gap": apart,
+        "beside": {
+            who: _spread([report["beside"][who]["both"]["mean"] for report in reports]) for who in ("random", "idle")
+        },
+        "paper": None if theirs is None else {"sp": theirs.sp, "xp": theirs.xp},
+    }
+
+
+def _spread(values: Sequence[float | None]) -> dict[str, float | None]:
+    known = [value for value in values if value is not None]
+    if not known:
+        return {"mean": None, "low": None, "high": None}
+    return {"mean": float(np.mean(known)), "low": min(known), "high": max(known)}
+
+
+def _quality(comparison: Comparison) -> dict[str, Any]:
+    members, agents = [], []
+    for group in comparison.groups:
+        limits = comparison.thresholds.get(group.environment)
+        for run in group.runs if limits else ():
+            head = {"label": group.label, "environment": group.environment, "seed": run.seed, "run": run.run_id}
+            for one in (quality(member, limits) for member in run.members):
+                members.append(head | asdict(one))
+            for many in quality_costs(run, limits):
+                agents.append(head | asdict(many) | {"lower_bound": many.bound})
+    limits = {name: comparison.thresholds.get(name) for name in comparison.environments}
+    told = {name: None if limit is None else {"sp": limit.sp, "xp": limit.xp} for name, limit in limits.items()}
+    return {"thresholds": told, "members": members, "agents": agents}
+
+
+def _budget(budget: Budget) -> dict[str, Any]:
+    names = ("source", "method", "environment", "agents", "reading", "budget", "total", "ratio")
+    return {name: getattr(budget, name) for name in names} | {"steps": dict(budget.steps)}
+
+
+def _notes(comparison: Comparison) -> list[str]:
+    """Sentences about what the figures do not say by themselves."""
+    notes = ["Simulated steps (of an exact simulator used as dynamics model) are counted apart and in no total."]
+    runs = [run for group in comparison.groups for run in group.runs]
+    if any(len(run.members) < comparison.agents for run in runs):
+        notes.append("Points with more agents than a run has are extrapolated: a line through members 2 and up.")
+    for name in comparison.environments:
+        if (steps := paper.xpm_wm_budget(name, comparison.agents)) is not None:
+            notes.append(f"The paper's XPM-WM took {steps:,} steps for {comparison.agents} agents on {name}.")
+    for run in runs:
+        if len(run.members) == 1:
+            notes.append(f"{run.run_id} has one agent, from which nothing is extrapolated.")
+        if run.settings.get("diversity.order") == "concurrent":
+            notes.append(f"{run.run_id} trained its agents together: for fewer agents it is these agents' share.")
+        if adopted := sum(m.adopted for m in run.members):
+            notes.append(f"{run.run_id} took over {adopted} agents of another run, with the steps of that run.")
+        if run.attempts > 1:
+            notes.append(
+                f"{run.run_id} was started {run.attempts} times: {run.lost_steps:,} steps were done again and are in "
+                "no total; seconds are those of each agent's last start."
+            )
+    if len({run.scale for run in runs}) > 1:
+        notes.append(f"Scales differ: {', '.join(sorted({run.scale for run in runs}))}.")
+    for name in comparison.environments:
+        if name not in comparison.thresholds:
+            notes.append(f"No thresholds of equal quality for {name}: give --sp and --xp.")
+    return notes

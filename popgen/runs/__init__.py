@@ -1,0 +1,1 @@
+"""Operations of a run: folder, ledger, checkpoints, storage, recorder, monitoring, recovery."""

@@ -1,0 +1,218 @@
+"""Checkpoints: one of each finished member, and those at the boundaries between iterations of the running one.
+
+    checkpoints/
+      member_001/        both buffers, the world model's learner and the ledger's length after member 1
+      progress_NNNNNN/   of the running member: learners, samplers, generators, counters; the last two are kept
+      base_NNNNNN/       both buffers after segments_NNNNNN, where the log had become long
+      segments_NNNNNN    the log: what was sampled since the last member, one file for each call of a sampler
+
+The buffers are large and only ever grow at their end, so that an iteration's checkpoint holds a reference to the last
+whole copy of them and the number of segment files to add to it. `progress` appears at once, by a rename, and names
+everything it needs: whatever interrupts the writing, the old checkpoint or the new one is there. Should the newest be
+damaged, the one before it counts.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from popgen.errors import UserError
+from popgen.runs.segment_files import load_segments, save_segments
+from popgen.runs.state_files import load_state, save_state
+from popgen.types import Segment
+
+KEPT = 2
+"""Checkpoints of the running member that are there at any time, once there were so many."""
+
+
+@contextmanager
+def fitting(folder: Path) -> Iterator[None]:
+    """Around what puts a checkpoint's parts where they belong: parts that do not fit are told in one line.
+
+    Raises:
+        UserError: a part is missing, or of another size or type.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:  # torch's too
+        cause = getattr(error, "cause", error)  # Ray's error of an actor is of both types
+        reason = f"no {cause}" if isinstance(cause, KeyError) else str(cause).partition("\n")[0]
+        problem = f"its checkpoint does not fit this run ({reason})"
+        raise UserError(str(folder), problem, "remove it or start a new run") from None
+
+
+def same_form(value: Any, like: Any, name: str = "a part") -> None:
+    """Weights from a checkpoint against those that they are to replace: names, shapes and types.
+
+    Raises:
+        ValueError: they differ.
+    """
+    if isinstance(like, dict):
+        if not isinstance(value, dict) or value.keys() != like.keys():
+            raise ValueError(f"{name} has other tensors")
+        for key, item in like.items():
+            same_form(value[key], item, key)
+    elif not isinstance(value, np.ndarray) or (value.shape, value.dtype) != (like.shape, like.dtype):
+        raise ValueError(f"{name} is of another shape or type")
+
+
+def finished_member(root: Path, member: int) -> dict[str, Any]:
+    """The checkpoint of a finished member; its `ledger` is a length, or is not there.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    folder = member_folder(root, member)
+    state = load_state(folder)
+    length = state.get("ledger", 0)
+    if type(length) is not int or length < 0:
+        raise UserError(str(folder), "is no checkpoint of a finished member", "remove it or start a new run")
+    return state
+
+
+def _log_of(folder: Path, state: dict[str, Any]) -> dict[str, Any]:
+    """The part about the log, of a state that is a running member's."""
+    log = state.get("log")
+    found = log if isinstance(log, dict) else {}
+    counts = (state.get("member"), state.get("ledger"), *(found.get(name) for name in ("first", "count", "rows")))
+    whole = all(type(count) is int and 0 <= count < 2**63 for count in counts)
+    if not whole or found["first"] > found["count"] or not isinstance(found.get("base"), str | None):
+        raise UserError(str(folder), "is no checkpoint of a running member", "remove it or start a new run")
+    return found
+
+
+def member_folder(root: Path, member: int) -> Path:
+    """Where a run keeps the checkpoint of a finished member."""
+    return root / "checkpoints" / f"member_{member:03d}"
+
+
+class Checkpoints:
+    """The iteration checkpoints of one run.
+
+    Args:
+        root: the run's folder.
+        long: rows in the log from which on a whole copy of the buffers is written.
+        seconds: least time between two checkpoints.
+
+    Attributes:
+        note: what `load` has to say about a damaged checkpoint.
+    """
+
+    def __init__(self, root: Path, *, long: int, seconds: float) -> None:
+        self.folder, self.long, self.seconds = root / "checkpoints", long, seconds
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.base: str | None = None
+        self.first = self.count = self.rows = 0
+        self.needed: dict[int, dict[str, Any]] = {}
+        self.last = time.monotonic()
+        self.note = ""
+
+    def load(self, member: int) -> dict[str, Any] | None:
+        """The running member's last whole checkpoint, None if there is none of this member.
+
+        Raises:
+            UserError: all are damaged.
+        """
+        damage: UserError | None = None
+        for number in reversed(self._numbers()):
+            try:
+                state = load_state(self._progress(number))
+                log = _log_of(self._progress(number), state)
+            except UserError as error:
+                damage = damage or error
+                continue
+            if damage is not None:
+                self.note = f"{damage.field}: {damage.problem}; the checkpoint before it counts"
+                self._drop_progress(above=number)
+            if state["member"] != member:
+                return None
+            self.base, self.first, self.count, self.rows = log["base"], log["first"], log["count"], log["rows"]
+            self.needed = {number: log}
+            return state
+        if damage is not None:
+            raise damage
+        return None
+
+    def begin(self, base: Path | None) -> None:
+        """A new member: nothing to go back to but `base`, a checkpoint of a finished member."""
+        for path in (*self.folder.glob("progress*"), *self.folder.glob("base_*")):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in self.folder.glob("segments_*"):
+            path.unlink()
+        # By its name if it is our own: the folder may go on elsewhere.
+        own = base is not None and base.resolve().parent == self.folder.resolve()
+        self.base = None if base is None else base.name if own else str(base.resolve())
+        self.first = self.count = self.rows = 0
+        self.needed = {}
+        self.last = time.monotonic()
+
+    def keep(self, segments: list[Segment], owner: int) -> None:
+        """Add to the log."""
+        save_segments(self._segments(self.count), segments, owner)
+        self.count += 1
+        self.rows += sum(segment.steps for segment in segments)
+
+    def due(self) -> bool:
+        """Is it time for the next one?"""
+        return time.monotonic() - self.last >= self.seconds
+
+    def save(self, member: int, state: dict[str, Any], replays: Callable[[], dict[str, Any]]) -> None:
+        """Write `state`; `replays` gives the whole buffers, asked for where the log has become long."""
+        if self.rows >= self.long:
+            name = f"base_{self.count:06d}"
+            save_state(self.folder / name, replays())
+            self.base, self.first, self.rows = name, self.count, 0
+        log = {"base": self.base, "first": self.first, "count": self.count, "rows": self.rows}
+        number = max((0, *self._numbers())) + 1
+        save_state(self._progress(number), {**state, "member": member, "log": log})
+        self.needed[number] = log
+        self._tidy()
+        self.last = time.monotonic()
+
+    def _tidy(self) -> None:
+        """Remove what none of the kept checkpoints needs."""
+        self.needed = {number: self.needed[number] for number in sorted(self.needed)[-KEPT:]}
+        for number in self._numbers():
+            if number not in self.needed:
+                shutil.rmtree(self._progress(number), ignore_errors=True)
+        bases, first = {log["base"] for log in self.needed.values()}, min(log["first"] for log in self.needed.values())
+        for path in self.folder.glob("base_*"):
+            if path.name not in bases:
+                shutil.rmtree(path, ignore_errors=True)
+        for path in self.folder.glob("segments_*"):
+            if int(path.name.rpartition("_")[2]) < first:
+                path.unlink()
+
+    def replays(self) -> dict[str, Any] | None:
+        """The whole copy of the buffers that the loaded checkpoint starts from; None for empty ones."""
+        return None if self.base is None else load_state(self.folder / self.base)
+
+    def log(self) -> Iterator[tuple[list[Segment], int]]:
+        """Segments (with owner) to add to that, in order."""
+        for number in range(self.first, self.count):
+            yield load_segments(self._segments(number))
+
+    def _numbers(self) -> list[int]:
+        """Of the checkpoints that are there, ascending."""
+        names = (path.name.partition("_")[2] for path in self.folder.glob("progress_*"))
+        return sorted(int(name) for name in names if name.isdecimal())
+
+    def _drop_progress(self, above: int) -> None:
+        for number in self._numbers():
+            if number > above:
+                shutil.rmtree(self._progress(number), ignore_errors=True)
+
+    def _progress(self, number: int) -> Path:
+        return self.folder / f"progress_{number:06d}"
+
+    def _segments(self, number: int) -> Path:
+        return self.folder / f"segments_{number:06d}"

@@ -1,0 +1,258 @@
+"""The state of a run as its folder tells it: who is at it, how far it is, and how it ended.
+
+    runs/RUN_ID/
+      run.lock      locked by the driver as long as it lives; the system unlocks it, however the driver ends
+      state.json    of the last attempt: its outcome, when it began, seconds of all attempts, what went wrong
+
+A driver that was killed leaves the state "running" behind, and nobody holds the lock: the run was interrupted.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import math
+import os
+import socket
+import time
+from collections import Counter
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TextIO
+
+from popgen.config.run_config import RunConfig
+from popgen.errors import UserError
+from popgen.runs.state_files import read_regular
+
+LOCK, STATE = "run.lock", "state.json"
+STATES = ("running", "finished", "failed", "interrupted", "damaged")
+OUTCOMES = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "interrupted"}
+"""MLflow's status of a run -> ours."""
+
+_STATE_TYPES: dict[str, Any] = {
+    **{"state": str, "attempt": int, "pid": int, "host": str},
+    **{"began": int | float, "seconds": int | float, "error": str},
+}
+_TAKEN = (errno.EAGAIN, errno.EACCES)
+_TRIES, _PAUSE = 40, 0.05  # a look at the lock holds it for a moment, and a killed process until it is gone
+_ACTIVE = ("metrics.jsonl", "ledger.jsonl", STATE)
+"""Files that a living driver writes to: the last of these times is when an attempt was last heard of."""
+
+
+def named(config: RunConfig) -> RunConfig:
+    """The config with an id for its run: method, environment, seed and time, if it has none."""
+    if config.run.id:
+        return config
+    stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+    name = f"{config.method}-{Path(config.env.name).stem}-s{config.run.seed}-{stamp}"
+    return config.model_copy(update={"run": config.run.model_copy(update={"id": name})})
+
+
+def run_folder(config: RunConfig) -> Path:
+    """Where a `named` run keeps everything."""
+    return Path(config.run.root) / str(config.run.id)
+
+
+class RunState:
+    """The driver's hold on its run's folder: one driver at a time.
+
+    Args:
+        folder: the run's, which exists.
+
+    Raises:
+        UserError: another driver is at work on it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.began, self._past, self._attempt = folder, time.time(), 0.0, 0
+        self._file = open(folder / LOCK, "a+", encoding="utf-8", errors="replace")  # noqa: SIM115 (held until the end)
+        if not _lock(self._file):
+            self._file.seek(0)
+            holder = self._file.read(200).strip() or "another process"
+            self._file.close()
+            problem = f"{folder.name} is being run by {holder}"
+            raise UserError("run.id", problem, "wait for it, stop it, or choose another id")
+        self._file.truncate(0)
+        self._file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        self._file.flush()
+
+    @staticmethod
+    def check_free(folder: Path) -> None:
+        """Nobody is at work on this run, whose folder need not be there yet.
+
+        Raises:
+            UserError: another driver is.
+        """
+        if (folder / LOCK).exists():
+            RunState(folder).release()
+
+    def start(self, attempt: int) -> None:
+        """The attempt begins."""
+        try:
+            self._past = _seconds(self.folder, read_state(self.folder))
+        except (OSError, ValueError, OverflowError, RecursionError):
+            self._past = 0.0  # a damaged file costs the time of earlier attempts, and nothing else
+        self.began, self._attempt = time.time(), attempt
+        self._write("running")
+
+    def end(self, status: str, error: BaseException | None = None) -> None:
+        """It ended with an MLflow status; the lock is given up."""
+        text = None if error is None else " ".join((str(error) or type(error).__name__).split())[:500]
+        self._write(OUTCOMES[status], text)
+        self.release()
+
+    def release(self) -> None:
+        """Give up the lock, for the next attempt of this process: the state stays what it is."""
+        self._file.close()
+
+    def _write(self, state: str, error: str | None = None) -> None:
+        now = time.time()
+        values = {
+            "state": state,
+            "attempt": self._attempt,
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "began": round(self.began, 3),
+            "seconds": round(self._past + (0.0 if state == "running" else now - self.began), 1),
+            "error": error,
+        }
+        fresh = self.folder / f"{STATE}.writing"
+        fresh.write_text(json.dumps(values), encoding="utf-8")
+        fresh.replace(self.folder / STATE)
+
+
+def _lock(file: TextIO) -> bool:
+    """Take the lock for the file's life; False if another process holds it.
+
+    A record lock: it belongs to the process, no child inherits it, and NFS carries it to other hosts. Where the file
+    system has no locks, nobody is kept out.
+    """
+    for _ in range(_TRIES):
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except OSError as error:
+            if error.errno not in _TAKEN:
+                return True
+        time.sleep(_PAUSE)
+    return False
+
+
+def list_runs(root: Path) -> list[dict[str, Any]]:
+    """All runs below `root`, the oldest first; see `describe_run`.
+
+    Raises:
+        UserError: no such folder.
+    """
+    if not root.is_dir():
+        raise UserError(str(root), "is not a folder", "give the one that holds the runs (run.root)")
+    folders = [path for path in root.iterdir() if (path / "config.json").is_file()]
+    return sorted((describe_run(path) for path in folders), key=lambda run: (run["began"] or 0.0, run["id"]))
+
+
+def describe_run(folder: Path) -> dict[str, Any]:
+    """What a run's folder tells of it; nothing in it is changed.
+
+    Keys: id; state (running, finished, failed, interrupted, damaged); method, scale, environment; member (the one
+    that is trained, or the last one) of size; steps (environment steps by ledger kind) and total_steps; seconds of all
+    attempts; attempt; began (of the last attempt, seconds since 1970); error (of the last attempt, None without one).
+    A folder with a file that cannot be read is "damaged", and `error` names it.
+    """
+    known: dict[str, Any] = {"id": _plain(folder.name), "state": "damaged", "method": None, "scale": None}
+    known |= {"environment": None, "member": None, "size": None, "steps": {}, "total_steps": 0}
+    known |= {"seconds": 0.0, "attempt": None, "began": None, "error": None}
+    path = folder / "config.json"
+    try:
+        config = json.loads(read_regular(path))
+        named = {"method": config["method"], "scale": config["scale"], "environment": config["env"]["name"]}
+        known |= {key: _plain(value) for key, value in named.items()} | {"size": int(config["population"]["size"])}
+        path = folder / STATE
+        state = read_state(folder)
+        known |= {"seconds": _seconds(folder, state), "attempt": state.get("attempt"), "began": state.get("began")}
+        path = folder / "population" / "manifest.json"
+        members = len(json.loads(read_regular(path))["members"]) if path.exists() else 0
+        known["member"] = min(members + 1, known["size"])
+        path = folder / "ledger.jsonl"
+        known["steps"] = _steps(path)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        return known | {"error": f"{path.relative_to(folder)} cannot be read ({_reason(error)})"}
+    done = members >= known["size"] and (folder / "report" / "crossplay.json").exists()
+    told = state.get("error")
+    known |= {"state": _present(folder, state, done), "error": None if told is None else _plain(told)}
+    return known | {"total_steps": sum(known["steps"].values())}
+
+
+def _plain(value: Any) -> str:
+    """Text in one line that a terminal takes for text: what other programs wrote may hold control characters."""
+    return "".join(letter if letter.isprintable() else "?" for letter in str(value))
+
+
+def _present(folder: Path, state: dict[str, Any], done: bool) -> str:
+    told = state.get("state")
+    if told == "running":
+        return "running" if _is_alive(folder / LOCK, state) else "interrupted"
+    if told in STATES:
+        return str(told)
+    return "finished" if done else "interrupted"  # of a version that did not write the file
+
+
+def _is_alive(lock: Path, state: dict[str, Any]) -> bool:
+    """Is the driver at work? Not to be asked by the driver's own process, whose lock it would end."""
+    try:
+        with open(lock, "rb") as file:
+            fcntl.lockf(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        if error.errno in _TAKEN:
+            return True
+    # No locks here: what is left is its process, on this host.
+    return state.get("host") != socket.gethostname() or Path(f"/proc/{state.get('pid')}").exists()
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """`state.json`, {} without one.
+
+    Raises:
+        OSError, ValueError, RecursionError: it cannot be read, or a field is not of its type.
+    """
+    path = folder / STATE
+    if not path.exists():
+        return {}
+    state = json.loads(read_regular(path))
+    if not isinstance(state, dict):
+        raise ValueError("no object")
+    for name, kinds in _STATE_TYPES.items():
+        value = state.get(name)
+        wrong = isinstance(value, bool) or not isinstance(value, kinds)
+        if value is not None and (wrong or isinstance(value, float) and not math.isfinite(value)):
+            raise ValueError(f"{name} is {value!r:.40}")
+    return state
+
+
+def _seconds(folder: Path, state: dict[str, Any]) -> float:
+    """Of all attempts; one that ended without a word lasted until it was last heard of."""
+    known = float(state.get("seconds") or 0.0)
+    if state.get("state") != "running":
+        return known
+    heard = max((folder / name).stat().st_mtime for name in _ACTIVE if (folder / name).exists())
+    return round(known + max(0.0, heard - float(state.get("began") or heard)), 1)
+
+
+def _steps(ledger: Path) -> dict[str, int]:
+    """Environment steps by kind; a line that is still being written does not count."""
+    steps: Counter[str] = Counter()
+    whole = read_regular(ledger).rpartition(b"\n")[0] if ledger.exists() else b""
+    for line in whole.splitlines():
+        entry = json.loads(line)
+        steps[_plain(entry["kind"])] += int(entry["steps"])
+    return dict(steps)
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, KeyError):
+        return f"it has no {error.args[0]!r}"
+    text = getattr(error, "strerror", None) or str(error)
+    return _plain(" ".join(text.split())[:120]) or type(error).__name__

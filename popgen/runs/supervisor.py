@@ -1,0 +1,116 @@
+"""`popgen run` in a process of its own, which is made again when Ray's library has ended it.
+
+Where the driver is talking to a raylet or a control store that dies, Ray's library ends the whole process: exit code 1,
+no exception, no message. Nothing in that process can go on, but the run can, as it would if it were submitted again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+
+from popgen.errors import UserError
+from popgen.runs.directory import read_state
+
+FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGCONT)
+RAY_ENDED_US = 1
+"""Exit code of a process that Ray's library ended; also that of a traceback, before which a run's state is written."""
+
+LOOK = 0.1
+"""Seconds between two looks at the child."""
+
+_PARENT_DEATH = 1  # prctl's PR_SET_PDEATHSIG
+
+
+def guarded(folder: Path, retries: int) -> int | None:
+    """Go on in a child process, and in another one whenever Ray's library ended it.
+
+    What ends the child otherwise ends this process alike: an exit code, or a signal. Signals to this process reach
+    the child once, which is in a process group of its own, and the child does not outlive this process.
+
+    Args:
+        folder: the run's, which need not exist.
+        retries: times in a row that the child may be ended without a new ledger entry in between.
+
+    Returns:
+        None in the child, which is to do the work, or where children cannot be bound to their parent (not Linux);
+        in the parent the exit code, when the work is over.
+
+    Raises:
+        UserError: the child was ended too often.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    spent, most = 0, -1
+    while (pid := _fork()) != 0:
+        code = _wait(pid)
+        if not _without_a_word(folder, pid, code):
+            return _same_end(code)
+        done = _size(folder / "ledger.jsonl")
+        spent, most = 1 if done > most else spent + 1, max(most, done)
+        if spent > retries:
+            problem = f"Ray ended the driver {spent} times in a row without progress"
+            raise UserError("cluster", problem, "see Ray's logs; the same run.id goes on from the last checkpoint")
+        print(f"popgen: Ray ended the driver: {folder.name} goes on from its last checkpoint", file=sys.stderr)
+    return None
+
+
+def _fork() -> int:
+    """The child's id in this process, 0 in the child."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    parent = os.getpid()
+    if (pid := os.fork()) != 0:
+        return pid
+    os.setpgid(0, 0)
+    ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
+    if os.getppid() != parent:  # it was gone before we could say so
+        os._exit(RAY_ENDED_US)
+    return 0
+
+
+def _wait(pid: int) -> int:
+    """The child's exit code, or less the number of the signal that ended it; signals are forwarded meanwhile."""
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
+        if number == signal.SIGTSTP:
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+    before = {number: signal.signal(number, forward) for number in FORWARDED}
+    try:  # not blocked in waitpid: a signal that comes just before it would wait there with us
+        while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
+            time.sleep(LOOK)
+        return os.waitstatus_to_exitcode(ended[1])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _without_a_word(folder: Path, pid: int, code: int) -> bool:
+    """It was at the run, and ended by no signal and without writing how: nothing but Ray's library does that."""
+    try:
+        state = read_state(folder)
+    except (OSError, ValueError, RecursionError):
+        return False
+    return code == RAY_ENDED_US and (state.get("state"), state.get("pid")) == ("running", pid)
+
+
+def _same_end(code: int) -> int:
+    """The exit code; of the signal that ended the child this process dies too."""
+    if code < 0:
+        if -code != signal.SIGKILL:
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    return code
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from popgen.methods.xpm_wm.imagination import imagine
+from popgen.methods.xpm_wm.latents import Latent
+
+
+class Counter:
+    """A model whose state is a number: h' = 10 h + a^0 + 2 a^1; reward and continuation depend on it alone."""
+
+    def step(self, latent: Latent, actions: Tensor, generator: Any = None) -> Latent:
+        return Latent(10 * latent.h + (actions * torch.tensor([1.0, 2.0])).sum(-1, keepdim=True), latent.z)
+
+    def reward(self, latent: Latent) -> Tensor:
+        return 100 + latent.h.squeeze(-1)
+
+    def continuation(self, latent: Latent) -> Tensor:
+        return 1.0 / (1.0 + latent.h.squeeze(-1) % 10)
+
+
+def last_digit(latent: Latent) -> Tensor:
+    """Player 0 plays the last digit of the state (at most 3), player 1 plays 1."""
+    digit = (latent.h.squeeze(-1) % 10).long().clamp(max=3)
+    return torch.stack([digit, torch.ones_like(digit)], -1)
+
+
+def test_rewards_are_those_of_arrival_and_weights_those_of_departure() -> None:
+    start = Latent(torch.tensor([[0.0], [3.0]]), torch.zeros(2, 4))
+    imagined = imagine(Counter(), last_digit, start, horizon=3)  # type: ignore[arg-type]
+    # Row 0: 0 -(0,1)-> 2 -(2,1)-> 24 -(3,1)-> 245.   Row 1: 3 -(3,1)-> 35 -(3,1)-> 355 -(3,1)-> 3555.
+    assert imagined.latent.h.squeeze(-1).T.tolist() == [[0, 2, 24, 245], [3, 35, 355, 3555]]
+    assert imagined.actions[:, 0].tolist() == [[0, 1], [2, 1], [3, 1]]
+    assert imagined.actions[:, 1].tolist() == [[3, 1], [3, 1], [3, 1]]
+    assert imagined.reward.T.tolist() == [[102, 124, 345], [135, 455, 3655]]
+    torch.testing.assert_close(imagined.keep.T, torch.tensor([[1 / 3, 1 / 5, 1 / 6], [1 / 6, 1 / 6, 1 / 6]]))
+    # The first step always runs; each later one with the probability that all arrivals before it went on.
+    torch.testing.assert_close(imagined.running.T, torch.tensor([[1, 1 / 3, 1 / 15], [1, 1 / 6, 1 / 36]]))
+
+
+def test_imagination_carries_no_gradient() -> None:
+    start = Latent(torch.ones(2, 1, requires_grad=True), torch.zeros(2, 4))
+    imagined = imagine(Counter(), last_digit, start, horizon=2)  # type: ignore[arg-type]
+    assert not imagined.reward.requires_grad and not imagined.latent.h.requires_grad

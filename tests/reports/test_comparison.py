@@ -1,0 +1,381 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from support.finished import CRAMPED, finished_run
+
+from popgen.errors import UserError
+from popgen.reports import comparison_report, plots
+from popgen.reports import paper_figures as paper
+from popgen.reports.comparison import (
+    CONSTANT,
+    LINE,
+    MEASURED,
+    Band,
+    Group,
+    Thresholds,
+    budgets,
+    costs,
+    default_thresholds,
+    group_runs,
+    quality,
+    quality_costs,
+    step_band,
+    time_band,
+)
+from popgen.reports.comparison_report import Comparison, chosen_thresholds
+from popgen.reports.run_record import Point, RunRecord, read_curves, read_run
+
+RING = "overcooked/coordination_ring"
+
+
+@pytest.fixture(scope="module")
+def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four members: 1,000 steps, then 100 of self-play and 10, 20, 30 of cross-play."""
+    later = [{"SP": 100, "XP": 10 * partners} for partners in (1, 2, 3)]
+    curves = {
+        1: [(200, 3.0, None), (600, 9.0, None), (800, 8.0, None)],
+        2: [(40, 9.0, 5.0), (80, 8.5, 1.0), (110, 9.5, 0.0)],
+        3: [(60, 7.0, 0.0), (120, 8.0, 3.0)],
+    }
+    return finished_run(
+        tmp_path_factory.mktemp("runs"),
+        "model",
+        [{"random": 600, "SP": 400}, *later],
+        seconds=[500.0, 55.0, 60.0, 65.0],
+        curves=curves,
+        scores=(10.0, 1.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def model(model_run: Path) -> RunRecord:
+    return read_run(model_run)
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
+    steps = [{"SP": 80, "simulated": 5000}, {"SP": 40, "XP": 40, "simulated": 7000}]
+    return read_run(finished_run(tmp_path_factory.mktemp("runs"), "exact", steps, method="xpm_sim"))
+
+
+# --- reading
+
+
+def test_a_run_is_read_from_its_own_books(model: RunRecord, exact: RunRecord) -> None:
+    assert (model.method, model.label, model.seed, model.run_id) == ("xpm_wm", "xpm_wm", 0, "model")
+    assert model.environment.name == CRAMPED and model.environment.cooking == "auto"
+    assert [dict(m.steps) for m in model.members][:2] == [{"random": 600, "SP": 400}, {"SP": 100, "XP": 10}]
+    assert [m.real for m in model.members] == [1000, 110, 120, 130] and model.evaluation_steps == 77
+    assert model.members[1].curve == (Point(40, 9.0, 5.0), Point(80, 8.5, 1.0), Point(110, 9.5, 0.0))
+    assert model.members[3].curve == () and not model.members[0].adopted
+    assert exact.members[0].steps == {"SP": 80, "simulated": 5000} and exact.members[0].real == 80
+
+
+def test_reading_changes_nothing(model_run: Path) -> None:
+    before = {path: path.read_bytes() for path in model_run.rglob("*") if path.is_file()}
+    read_run(model_run)
+    assert before == {path: path.read_bytes() for path in model_run.rglob("*") if path.is_file()}
+
+
+def test_an_unfinished_line_of_a_ledger_is_refused_and_kept(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path, "cut", [{"SP": 10}])
+    ledger = folder / "ledger.jsonl"
+    ledger.write_bytes(ledger.read_bytes()[:-9])
+    with pytest.raises(UserError, match="no ledger entry"):
+        read_run(folder)
+    assert not ledger.read_bytes().endswith(b"\n")
+
+
+def test_unfinished_runs_are_refused_with_the_reason(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path, "part", [{"SP": 10}, {"SP": 10}])
+    config = json.loads((folder / "config.json").read_text())
+    config["population"]["size"] = 3
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"part: is unfinished: it has 2 of 3 members; finish it .*run.id=part"):
+        read_run(folder)
+    config["population"]["size"] = 2
+    (folder / "config.json").write_text(json.dumps(config))
+    read_run(folder)
+    (folder / "report" / "crossplay.json").unlink()
+    with pytest.raises(UserError, match="its members were not evaluated"):
+        read_run(folder)
+    with pytest.raises(UserError, match=r"is no run: it has no config.json"):
+        read_run(tmp_path)
+
+
+def test_a_ledger_that_contradicts_its_members_is_refused(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path, "odd", [{"SP": 10}, {"SP": 10}])
+    lines = (folder / "ledger.jsonl").read_text().splitlines()
+    (folder / "ledger.jsonl").write_text("\n".join(lines[1:]) + "\n")
+    with pytest.raises(UserError, match=r"counts 5 SP steps for member 1, member.json 10"):
+        read_run(folder)
+
+
+def test_members_of_another_run_bring_their_own_steps(tmp_path: Path) -> None:
+    origin = finished_run(tmp_path, "origin", [{"SP": 10}, {"SP": 4}], curves={1: [(5, 9.0, None)], 2: [(4, 1.0, 1.0)]})
+    folder = finished_run(tmp_path, "goes_on", [{"SP": 10}, {"SP": 6}], curves={2: [(6, 8.0, 0.0)]})
+    config = json.loads((folder / "config.json").read_text())
+    config["population"] |= {"init_from": str(origin), "init_members": 1}
+    (folder / "config.json").write_text(json.dumps(config))
+    lines = (folder / "ledger.jsonl").read_text().splitlines()
+    (folder / "ledger.jsonl").write_text("\n".join(line for line in lines if '"member": 1,' not in line) + "\n")
+    run = read_run(folder)
+    assert [(m.real, m.adopted) for m in run.members] == [(10, True), (6, False)]
+    assert run.members[0].curve == (Point(5, 9.0, None),) and run.members[1].curve == (Point(6, 8.0, 0.0),)
+
+
+def test_points_of_a_resumed_run_count_once_and_cross_play_is_the_latest(tmp_path: Path) -> None:
+    rows: list[dict[str, Any]] = [
+        {"member": 2, "step": 10, "real_sp": 1.0, "real_xp_max": 4.0},
+        {"member": 2, "step": 20, "real_sp": 2.0},
+        {"member": 2, "step": 30, "real_sp": 3.0, "real_xp_max": 2.0},
+        {"member": 2, "step": 20, "real_sp": 5.0, "real_xp": 1.0, "simulated_steps": 900.0},  # after an interruption
+        {"member": 2, "step": 25, "agent/loss": 1.0},
+    ]
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = read_curves(path)
+    assert found == {2: (Point(10, 1.0, 4.0), Point(20, 2.0, 4.0), Point(20, 5.0, 1.0, 900))}
+    path.write_text("[1]\n")
+    with pytest.raises(UserError, match="no point of metrics"):
+        read_curves(path)
+
+
+# --- costs
+
+
+def test_costs_are_sums_and_go_on_in_a_line(model: RunRecord) -> None:
+    found = costs(model, 6)
+    assert [c.agents for c in found] == [1, 2, 3, 4, 5, 6]
+    assert [c.real for c in found] == pytest.approx([1000, 1110, 1230, 1360, 1500, 1650])  # members 5, 6: 140 and 150
+    assert found[5].steps == pytest.approx({"random": 600, "SP": 900, "XP": 150, "MP": 0, "simulated": 0})
+    assert [c.rule for c in found] == [MEASURED] * 4 + [LINE] * 2 and not found[4].measured
+    # Members 2 to 4 took 180 s for 360 steps; 5 and 6 take 140 and 150 steps.
+    assert [c.seconds for c in found] == pytest.approx([500, 555, 615, 680, 750, 825])
+
+
+def test_one_later_member_is_held_and_one_member_is_not_extrapolated(exact: RunRecord, tmp_path: Path) -> None:
+    found = costs(exact, 4)
+    assert [c.real for c in found] == [80, 160, 240, 320] and found[3].rule == CONSTANT
+    assert [c.simulated for c in found] == [5000, 12_000, 19_000, 26_000]
+    assert [c.seconds for c in found] == [60, 120, 180, 240]
+    alone = read_run(finished_run(tmp_path, "alone", [{"SP": 5}], method="mappo", seconds=[None]))
+    assert [(c.agents, c.real, c.seconds) for c in costs(alone, 8)] == [(1, 5, None)]
+
+
+def test_extrapolated_members_never_cost_less_than_nothing(tmp_path: Path) -> None:
+    run = read_run(finished_run(tmp_path, "falling", [{"SP": 100}, {"SP": 100}, {"SP": 40}]))
+    assert [c.real for c in costs(run, 6)] == pytest.approx([100, 200, 240, 240, 240, 240])
+
+
+def test_bands_are_over_seeds_and_as_long_as_all_of_them(model: RunRecord, tmp_path: Path) -> None:
+    other = read_run(finished_run(tmp_path, "seed1", [{"SP": 2000}, {"SP": 200}], seed=1, seconds=[10.0, None]))
+    group = Group("xpm_wm", "xpm_wm", CRAMPED, (model, other))
+    band = step_band(group, 3)
+    assert band.agents.tolist() == [1, 2, 3] and band.mean.tolist() == pytest.approx([1500, 1655, 1815])
+    assert band.low.tolist() == pytest.approx([1000, 1110, 1230])
+    assert band.high.tolist() == pytest.approx([2000, 2200, 2400])
+    assert band.measured.tolist() == [True, True, False]
+    assert step_band(group, 3, "SP").mean[0] == 1200
+    assert len(time_band(group, 3).agents) == 0
+
+
+# --- equal quality
+
+
+def test_quality_is_the_first_real_point_past_both_thresholds(model: RunRecord) -> None:
+    limits = Thresholds(8.0, 2.0)
+    found = [quality(member, limits) for member in model.members]
+    assert [(q.steps, q.spent, q.known) for q in found] == [
+        (600, 1000, True),
+        (80, 110, True),
+        (None, 120, True),
+        (None, 130, False),
+    ]
+    assert [(q.agents, q.steps, q.reached, q.bound) for q in quality_costs(model, limits)] == [
+        (1, 600, 1, False),
+        (2, 680, 2, False),
+        (3, 800, 2, True),
+        (4, 930, 2, True),
+    ]
+    assert quality(model.members[1], Thresholds(9.0, 5.0)).steps == 40
+    assert quality(model.members[2], Thresholds(8.0, 3.0)).steps == 120
+
+
+def test_a_later_member_without_cross_play_has_not_passed(tmp_path: Path) -> None:
+    curves = {1: [(5, 9.0, None)], 2: [(5, 9.0, None)]}
+    run = read_run(finished_run(tmp_path, "blind", [{"SP": 9}, {"SP": 9}], curves=curves))
+    assert [quality(member, Thresholds(8.0, 2.0)).steps for member in run.members] == [5, None]
+
+
+def test_thresholds_are_the_papers_or_the_users(model: RunRecord) -> None:
+    assert default_thresholds(CRAMPED) == Thresholds(8.18, 2.05) and default_thresholds("rendezvous/mppmr") is None
+    groups = group_runs([model])
+    assert chosen_thresholds(groups, None, 1.0) == {CRAMPED: Thresholds(8.18, 1.0)}
+    far = [Group("lipo", "lipo", "rendezvous/mppmr", ())]
+    assert chosen_thresholds(far, None, None) == {}
+    assert chosen_thresholds(far, 20.0, -50.0) == {"rendezvous/mppmr": Thresholds(20.0, -50.0)}
+    with pytest.raises(UserError, match="--xp"):
+        chosen_thresholds(far, 20.0, None)
+
+
+# --- which runs can be compared
+
+
+def test_environments_must_agree(tmp_path: Path, model: RunRecord) -> None:
+    cooks = read_run(finished_run(tmp_path, "cooks", [{"SP": 1}], method="lipo", params={"cooking": "interact"}))
+    with pytest.raises(UserError, match=r"cooks: cooking is interact, in .*model it is auto"):
+        group_runs([model, cooks])
+    longer = read_run(finished_run(tmp_path, "longer", [{"SP": 1}], method="lipo", params={"horizon": 30}))
+    with pytest.raises(UserError, match=r"longer: overcooked/cramped_room is not that of .*model: horizon is 30"):
+        group_runs([model, longer])
+    ring = read_run(finished_run(tmp_path, "ring", [{"SP": 1}], method="lipo", env=RING))
+    assert [group.environment for group in group_runs([ring, model])] == [RING, CRAMPED]
+
+
+def test_runs_of_one_label_must_be_seeds_of_one_thing(tmp_path: Path, model: RunRecord) -> None:
+    seed1 = finished_run(tmp_path, "seed1", [{"SP": 1}], seed=1, settings={"evaluation": {"episodes": 3}})
+    assert len(group_runs([model, read_run(seed1)])[0].runs) == 2
+    again = finished_run(tmp_path, "again", [{"SP": 1}])
+    with pytest.raises(UserError, match="with seed 0, like"):
+        group_runs([model, read_run(again)])
+    assert len(group_runs([model, read_run(again, "other")])) == 2
+    weak = finished_run(tmp_path, "weak", [{"SP": 1}], seed=2, settings={"agent": {"lambda_xp": 0.0}})
+    with pytest.raises(UserError, match=r"agent.lambda_\w+ is .*; tell them apart with NAME=RUN"):
+        group_runs([model, read_run(weak)])
+    with pytest.raises(UserError, match="given twice"):
+        group_runs([model, model])
+    with pytest.raises(UserError, match="none to compare"):
+        group_runs([])
+
+
+# --- the paper's numbers
+
+
+def test_budgets_of_the_baselines_under_both_readings() -> None:
+    # Eight agents: 8 budgets of self-play; 28 pairs, or 7 agents that have a partner.
+    assert paper.baseline_budget("lipo", 8, paper.PER_PREDECESSOR, 10) == {"SP": 80, "XP": 280}
+    assert paper.baseline_budget("comedi", 8, paper.PER_PREDECESSOR, 10) == {"SP": 80, "XP": 280, "MP": 280}
+    assert paper.baseline_budget("comedi", 8, paper.PER_AGENT, 10) == {"SP": 80, "XP": 70, "MP": 70}
+    assert paper.xpm_wm_budget(CRAMPED, 8) == 34_000_000 and paper.xpm_wm_budget("overcooked/mine", 8) is None
+    ratios = {
+        reading: [
+            sum(paper.baseline_budget("comedi", 8, reading).values()) / paper.xpm_wm_budget(layout, 8)  # type: ignore[operator]
+            for layout in paper.XPM_WM_STEPS
+        ]
+        for reading in paper.READINGS
+    }
+    # "At least 3 times more sample efficient than CoMeDi in all layouts" is true of one reading only.
+    assert min(ratios[paper.PER_PREDECESSOR]) > 3 > min(ratios[paper.PER_AGENT])
+
+
+def test_budgets_are_printed_for_the_paper_and_for_our_own_runs(tmp_path: Path, model: RunRecord) -> None:
+    steps = [{"SP": 90}, {"SP": 110, "XP": 40}]
+    lipo = read_run(finished_run(tmp_path, "ours", steps, method="lipo"))
+    found = {(b.source, b.method, b.reading): b for b in budgets(group_runs([model, lipo]), 4)}
+    assert len(found) == 6
+    assert found["paper", "lipo", paper.PER_AGENT].total == 6_000_000 * (4 + 3)
+    assert found["paper", "comedi", paper.PER_PREDECESSOR].ratio == pytest.approx(6 * (4 + 6 + 6) / 26)
+    assert found["ours", "lipo", paper.PER_PREDECESSOR].total == 100 * (4 + 6)
+
+
+def test_the_papers_averages_are_those_of_its_agents() -> None:
+    for row in paper.SABOTAGE.values():
+        assert np.mean(row.agents) == pytest.approx(row.average, abs=0.006)
+    mean = np.mean([scores["xpm_wm"].sp for name, scores in paper.SCORES.items() if name.startswith("overcooked")])
+    assert mean == pytest.approx(12.36, abs=0.005)
+
+
+# --- the report
+
+
+@pytest.fixture(scope="module")
+def comparison(model: RunRecord, exact: RunRecord, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    root = tmp_path_factory.mktemp("others")
+    seed1 = finished_run(root, "seed1", [{"SP": 1200}, {"SP": 90, "XP": 30}], seed=1, scores=(9.0, 3.0))
+    steps = [{"SP": 900}, {"SP": 900, "XP": 300, "MP": 300}, {"SP": 900, "XP": 600, "MP": 600}]
+    comedi = finished_run(root, "comedi", steps, method="comedi", settings={"diversity": {"order": "sequential"}})
+    ring = finished_run(root, "ring", [{"SP": 70}, {"SP": 7}], method="lipo", env=RING)
+    runs = [model, read_run(seed1), exact, read_run(comedi), read_run(ring)]
+    groups = group_runs(runs)
+    return Comparison(tuple(groups), 8, chosen_thresholds(groups, 8.0, 2.0))
+
+
+def test_json_holds_the_documented_keys(comparison: Comparison) -> None:
+    told = comparison_report.to_dict(comparison)
+    documented = re.findall(r"^    (\w[\w, ]*?)  +\S", comparison_report.__doc__ or "", re.M)
+    assert set(told) == {key.strip() for line in documented for key in line.split(",")}
+    json.dumps(told, allow_nan=False)
+    scores = {(row["environment"], row["label"]): row for row in told["scores"]}
+    assert scores[CRAMPED, "xpm_wm"]["sp"] == {"mean": 9.5, "low": 9.0, "high": 10.0}
+    assert scores[CRAMPED, "xpm_wm"]["gap"] == pytest.approx(7.5)
+    assert scores[CRAMPED, "xpm_wm"]["paper"] == {"sp": 10.23, "xp": 0.43}
+    assert scores[CRAMPED, "xpm_sim"]["paper"] is None
+    run = next(run for run in told["runs"] if run["label"] == "xpm_sim")
+    assert (run["real_steps"], run["simulated_steps"], run["evaluation_steps"]) == (160, 12_000, 77)
+
+
+def test_csv_marks_what_was_extrapolated(comparison: Comparison) -> None:
+    told = comparison_report.to_dict(comparison)
+    rows = list(csv.DictReader(io.StringIO(comparison_report.costs_csv(told))))
+    assert tuple(rows[0]) == comparison_report.COST_FIELDS and len(rows) == 5 * 8
+    found = {(row["environment"], row["run"], row["agents"]): row for row in rows}
+    assert found[CRAMPED, "model", "4"]["measured"] == "1" and found[CRAMPED, "model", "5"]["measured"] == "0"
+    assert found[CRAMPED, "model", "4"]["real_steps"] == "1360" and found[CRAMPED, "model", "5"]["rule"] == LINE
+    assert found[CRAMPED, "exact", "2"]["simulated_steps"] == "12000"
+    assert found[CRAMPED, "exact", "2"]["real_steps"] == "160"
+    assert found[CRAMPED, "comedi", "3"]["MP"] == "900" and found[CRAMPED, "comedi", "8"]["MP"] == "8400"
+    good = list(csv.DictReader(io.StringIO(comparison_report.quality_csv(told))))
+    assert tuple(good[0]) == comparison_report.QUALITY_FIELDS
+    assert [row["steps"] for row in good if row["run"] == "model"] == ["600", "80", "", ""]
+    budget = list(csv.DictReader(io.StringIO(comparison_report.budgets_csv(told))))
+    assert tuple(budget[0]) == comparison_report.BUDGET_FIELDS and len(budget) == 8 + 4
+
+
+def test_markdown_names_every_method_the_papers_rows_and_the_marks(comparison: Comparison) -> None:
+    text = comparison_report.to_markdown(comparison_report.to_dict(comparison))
+    assert "| overcooked/cramped_room | XPM-WM | 2 | 9.50 (9.00 to 10.00) |" in text
+    assert "| overcooked/cramped_room | LIPO | 0 | - | - | - | - | - | 8.99 | 2.40 |" in text
+    assert "8* |" in text and "> 930" in text and "XPM-Sim" in text
+    assert "Simulated steps" in text and "extrapolated" in text
+    assert all(len(table.columns) for table in comparison_report.to_tables(comparison_report.to_dict(comparison)))
+
+
+def test_charts_are_written_and_told_apart_without_colour(comparison: Comparison, tmp_path: Path) -> None:
+    files = comparison_report.write_report(comparison, tmp_path)
+    assert set(files) == {
+        *("comparison.json", "comparison.md", "costs.csv", "quality.csv", "budgets.csv"),
+        *(f"{name}.{suffix}" for name in ("steps", "steps_by_kind", "time", "quality") for suffix in ("png", "svg")),
+    }
+    assert all(path.stat().st_size for path in files.values())
+    svg = files["steps.svg"].read_text()
+    for text in ("number of agents M", "real environment steps", "extrapolated", "range over seeds", "XPM-Sim"):
+        assert text in svg
+    assert "simulated steps" in svg
+    assert "minutes of training" in files["time.svg"].read_text()
+    assert imread(files["steps.png"]).std() > 0.02
+    again = tmp_path / "again"
+    comparison_report.write_report(comparison, again)
+    assert (again / "steps.svg").read_text() == svg
+
+
+def test_styles_keep_a_methods_colour_and_give_others_what_is_left() -> None:
+    styles = plots.method_styles(["xpm_wm", "mine", "lipo", "yours"])
+    assert styles["xpm_wm"][0] == plots.METHOD_COLOURS["xpm_wm"]
+    assert len({colour for colour, _ in styles.values()}) == 4 == len({marker for _, marker in styles.values()})
+    assert set(plots.METHOD_COLOURS) == set(plots.METHOD_MARKERS) == set(paper.METHOD_NAMES)
+    assert len(set(plots.METHOD_COLOURS.values())) == len(plots.METHOD_COLOURS)
+
+
+def test_a_band_leaves_out_points_that_a_seed_does_not_have() -> None:
+    band = Band.over([[(1, 2.0, True), (2, 4.0, False)], [(1, 4.0, True), (2, None, True)], [(1, 6.0, True)]])
+    assert band.agents.tolist() == [1] and band.mean.tolist() == [4.0] and band.measured.tolist() == [True]

@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from popgen.config.run_config import RunConfig
+from popgen.config.sections import TrackingConfig
+from popgen.errors import UserError
+from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker, check_uri
+
+
+def history(tracker: Tracker, run: str, metric: str) -> list[tuple[int, float]]:
+    return [
+        (point.step, point.value) for point in client(tracker).get_metric_history(tracker.state()["runs"][run], metric)
+    ]
+
+
+def client(tracker: Tracker) -> Any:
+    from mlflow.tracking import MlflowClient
+
+    return MlflowClient(tracking_uri=tracker.uri)
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
+    """A finished run in two sittings: a population of two members, 2,500 points for the first."""
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "report").mkdir()
+    (folder / "report" / "matrix.json").write_text("{}")
+    first = Tracker(TrackingConfig(), folder, "run-1", RunConfig().model_dump(mode="json"))
+    for step in range(1250):
+        first.log({"loss": step / 2, "score": 1.0}, step=step, member=1)
+    first.log_scaling(1, 600_000)
+    first.log_artifact(folder / "report", "report")
+    first.log_artifact(folder / "report" / "matrix.json", member=1)
+    first.flush()
+    state = json.loads(json.dumps(first.state()))
+    second = Tracker(TrackingConfig(), folder, "run-1", RunConfig().model_dump(mode="json"), resume=state)
+    second.log({"loss": 9.0}, step=1250, member=1)
+    second.log({"loss": math.nan}, step=0, member=2)
+    second.log_scaling(2, 660_000)
+    second.finish()
+    return second
+
+
+def test_everything_lies_in_the_run_folder(tracked: Tracker) -> None:
+    assert {"mlflow.db", "mlflow_artifacts", "report"} == {path.name for path in tracked.run_dir.iterdir()}
+    assert [file.path for file in client(tracked).list_artifacts(tracked.state()["runs"]["parent"])] == ["report"]
+    assert len(list(tracked.run_dir.rglob("mlflow_artifacts/**/matrix.json"))) == 2
+
+
+def test_members_are_nested_in_the_parent(tracked: Tracker) -> None:
+    runs = {name: client(tracked).get_run(run) for name, run in tracked.state()["runs"].items()}
+    assert set(runs) == {"parent", "member_001", "member_002"}
+    parent = runs.pop("parent")
+    assert parent.info.run_name == "run-1" and parent.info.status == "FINISHED"
+    assert all(run.data.tags["mlflow.parentRunId"] == parent.info.run_id for run in runs.values())
+    assert all(run.info.status == "FINISHED" for run in runs.values())
+    assert (
+        parent.data.params["agent.lambda_xp"] == str(RunConfig().agent.lambda_xp)
+        and parent.data.params["env.name"] == RunConfig().env.name
+    )
+
+
+def test_metrics_of_both_sittings_are_there(tracked: Tracker) -> None:
+    assert history(tracked, "member_001", "loss") == [*((step, step / 2) for step in range(1250)), (1250, 9.0)]
+    assert len(history(tracked, "member_001", "score")) == 1250
+    assert math.isnan(history(tracked, "member_002", "loss")[0][1])
+
+
+def test_scaling_has_the_number_of_members_as_step(tracked: Tracker) -> None:
+    assert history(tracked, "parent", SCALING_METRIC) == [(1, 600_000.0), (2, 660_000.0)]
+
+
+def test_points_go_out_in_batches(tmp_path: Path) -> None:
+    tracker = Tracker(TrackingConfig(uri=f"sqlite:///{tmp_path / 'other.db'}"), tmp_path / "run", "r")
+    assert (tmp_path / "other.db").exists() and not (tmp_path / "run").exists()
+    calls: list[int] = []
+    real = tracker._client.log_batch
+
+    def counting(run: str, metrics: Any = (), **more: Any) -> None:
+        calls.append(len(metrics))
+        real(run, metrics=metrics, **more)
+
+    tracker._client.log_batch = counting
+    for step in range(1100):
+        tracker.log({"a": 1.0, "b": 2.0}, step=step)
+    assert calls == [1000, 1000]
+    tracker.flush()
+    assert calls == [1000, 1000, 200]
+
+    def broken(*_: Any, **__: Any) -> None:
+        raise ConnectionError("the store went away")
+
+    tracker._client.log_batch = broken
+    tracker.log({"a": 3.0}, step=2000)
+    tracker.flush()  # training goes on
+    tracker._client.log_batch = counting
+    tracker.flush()
+    assert calls[-1] == 1 and history(tracker, "parent", "a")[-1] == (2000, 3.0)
+
+
+def test_a_store_that_is_away_when_a_member_begins_gets_its_points_later(tmp_path: Path) -> None:
+    tracker = Tracker(TrackingConfig(), tmp_path, "r")
+    create = tracker._client.create_run
+
+    def away(*_: Any, **__: Any) -> None:
+        raise ConnectionError("the store went away")
+
+    tracker._client.create_run = away
+    tracker.log({"a": 1.0}, step=3, member=1)
+    tracker.flush()
+    assert tracker.state()["runs"].keys() == {"parent"}
+    tracker._client.create_run = create
+    tracker.flush()
+    assert history(tracker, "member_001", "a") == [(3, 1.0)]
+
+
+def test_an_artefact_that_is_not_taken_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class OfAnotherLibrary(Exception):
+        pass
+
+    def refuse(*_: Any) -> None:
+        raise OfAnotherLibrary("no such bucket")
+
+    tracker = Tracker(TrackingConfig(), tmp_path / "run", "r")
+    tracker.log_artifact(tmp_path / "gone.csv")
+    tracker._client.log_artifacts = refuse
+    tracker.log_artifact(tmp_path / "run")
+    assert len(caplog.records) == 2 and "no such bucket" in caplog.text
+    tracker.finish()
+
+
+def test_the_machines_load_is_kept_with_the_run(tmp_path: Path) -> None:
+    """One sample, taken here and not after ten seconds; an attempt that goes on goes on with it."""
+    config, state = TrackingConfig(system_metrics=True), None
+    for attempt in (0, 1):
+        tracker = Tracker(config, tmp_path, "r", resume=state)
+        monitor = tracker._monitor
+        assert monitor.sampling_interval == 10 and monitor._process.is_alive()
+        monitor.collect_metrics()
+        monitor.publish_metrics(monitor.aggregate_metrics())
+        tracker.finish()
+        assert monitor._process is None  # joined
+        state = tracker.state()
+        assert [step for step, _ in history(tracker, "parent", "system/cpu_utilization_percentage")] == [
+            *range(attempt + 1)
+        ]
+    found = client(tracker).get_run(state["runs"]["parent"]).data.metrics
+    assert {"system/system_memory_usage_megabytes", "system/disk_usage_percentage"} <= found.keys()
+
+
+def test_off_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mlflow", None)  # an import would fail
+    tracker = Tracker(TrackingConfig(enabled=False), tmp_path / "run", "r", {"a": 1})
+    tracker.log({"a": 1.0}, step=1)
+    tracker.log_scaling(1, 10)
+    tracker.log_artifact(tmp_path)
+    tracker.finish()
+    assert not tracker.enabled and tracker.state() == {"runs": {}} and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("uri", ["file:///tmp/x", "mlruns", "ftp://host", "http://127.0.0.1:9", "http://[bad"])
+def test_a_store_that_cannot_work_is_refused(uri: str) -> None:
+    with pytest.raises(UserError, match="tracking.uri"):
+        check_uri(uri, timeout=2.0)
+
+
+@pytest.mark.parametrize("uri", [None, "sqlite:////tmp/x.db", "postgresql+psycopg2://u@h/d"])
+def test_stores_that_need_no_server_pass(uri: str | None) -> None:
+    check_uri(uri)
+
+
+def test_a_store_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot open") as caught:
+        Tracker(TrackingConfig(uri=f"sqlite:///{tmp_path}/file/x.db"), tmp_path, "r")
+    assert "\n" not in str(caught.value)
