@@ -90,7 +90,7 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
         patch.setattr(ray, "put", lambda given: given)
         patch.setattr(pipeline, "Crew", LocalCrew)
         patch.setattr(pipeline, "Checkpoints", mortal(Checkpoints, "save"))
-        kind = mortal(mortal(mortal(RunRecorder, "record"), "record_steps"), "add_member")
+        kind = mortal(mortal(mortal(RunRecorder, "record_sampling"), "record_steps"), "add_member")
         spec = build_env(config.env, 1).spec
         recorder = kind(config, spec)
         try:

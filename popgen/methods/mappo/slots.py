@@ -172,7 +172,7 @@ class _Run:
         self.env.set_state(pool.states[self.rows])
         self.env.load_generator_state(pool.generator)
         self.group = np.repeat(np.arange(len(active)), [group.envs for group in self.groups])
-        self.team = np.array([group.members for group in self.groups], np.int32)[self.group]
+        self.match = np.array([group.members for group in self.groups], np.int32)[self.group]
         self.owner = np.array([group.owner for group in self.groups], np.int32)[self.group]
         self.mixed = np.array([group.kind is Kind.MP for group in self.groups])[self.group]
         for name in ("age", "whole", "score", "reward", "switch"):
