@@ -48,6 +48,7 @@ class EnvSpec:
         params: JSON-able parameters that make the same environment again through the registry.
         fingerprint: sha256 over name-independent rules (grid and parameters): two environments
             with the same fingerprint behave the same.
+        notes: what a user should know before training here, a sentence each; no part of what the environment is.
     """
 
     name: str
@@ -63,6 +64,7 @@ class EnvSpec:
     params: dict[str, Any] = field(default_factory=dict)
     fingerprint: str = ""
     num_players: int = 2
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def num_events(self) -> int:

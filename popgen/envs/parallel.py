@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -95,8 +96,7 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
             raise RuntimeError("the episode is over: call reset before step")
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"actions: none given for {', '.join(missing)}")
-        joint = np.array([[int(actions[agent]) for agent in self.agents]])
-        batch = self.env.step(joint)
+        batch = self.env.step(np.array([[_action(agent, actions[agent]) for agent in self.agents]]))
         players = self.agents
         reward = self._reward(batch)
         terminated, truncated = bool(batch.terminated[0]), bool(batch.truncated[0])
@@ -150,6 +150,18 @@ def parallel_env(
         UserError: unknown environment, parameter, view, reward or render mode.
     """
     return PopgenParallelEnv(make_env(name, 1, seed=seed, **params), view=view, reward=reward, render_mode=render_mode)
+
+
+def _action(agent: str, action: Any) -> int:
+    """A whole number, of whatever integer type.
+
+    Raises:
+        ValueError: it is something else, which a cast would change.
+    """
+    try:
+        return operator.index(action.item() if isinstance(action, np.ndarray) and action.size == 1 else action)
+    except TypeError:
+        raise ValueError(f"actions: {agent} plays {action!r}, which is no whole number") from None
 
 
 def _space(view: ViewSpec, shape: tuple[int, ...]) -> spaces.Box:

@@ -42,8 +42,8 @@ class Report:
     steps: int = 0
     seconds: float = 0.0
     differences: int = 0
-    events: np.ndarray = field(default_factory=lambda: np.zeros(k.NUM_EVENTS, int))
-    raw_events: np.ndarray = field(default_factory=lambda: np.zeros(k.NUM_EVENTS, int))
+    events: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    raw_events: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     drops: int = 0
     counter_pickups: int = 0
     unpaid: int = 0
@@ -117,24 +117,46 @@ class Comparison:
             assert batch.reward[game] == raw.reward[game] == sum(paid), f"reward {batch.reward[game]} is not {paid}"
             assert batch.score[game] == raw.score[game] == sum(value > 0 for value in paid)
             logged = infos["event_infos"]
-            want_raw = raw_event_vector(logged)
+            want_raw = self._paid_events(raw_event_vector(logged), next_state, paid)
             assert np.array_equal(raw.events[game], want_raw), f"{raw.events[game]} is not {want_raw}"
-            want = event_vector(self.mdp, state, next_state, joint, logged)
+            want = self._paid_events(event_vector(self.mdp, state, next_state, joint, logged), next_state, paid)
             assert np.array_equal(batch.events[game], want), f"{batch.events[game]} is not {want}"
             self._count(want, want_raw, logged, paid)
+            self._compare_training_reward(batch.events[game], paid)
             after.append(next_state)
         assert np.array_equal(batch.truncated, [state.timestep >= self.env.horizon for state in after])
         return after
+
+    def _paid_events(self, events: np.ndarray, after: Any, paid: list[float]) -> np.ndarray:
+        """(2, E) of overcooked_ai's five events: deliveries by what they paid, soups only if they are paid for."""
+        worths = self.env.tables.worths
+        found = np.zeros((2, self.env.spec.num_events), np.uint8)
+        found[:, : k.DELIVERS_SOUP] = events[:, : k.DELIVERS_SOUP]
+        for seat, player in enumerate(after.players):
+            if events[seat, k.TAKES_SOUP]:
+                found[seat, k.TAKES_SOUP] = self.mdp.get_recipe_value(after, player.held_object.recipe) > 0
+            if events[seat, k.DELIVERS_SOUP] and paid[seat] > 0:
+                found[seat, k.DELIVERS_SOUP + worths.index(float(paid[seat]))] = 1
+        return found
+
+    def _compare_training_reward(self, events: np.ndarray, paid: list[float]) -> None:
+        """A delivery pays in training what the game pays for it, in units of its dearest soup, and else nothing."""
+        weights, worth = self.env.spec.event_weights, self.env.tables.worths[-1]
+        deliveries = float(events[:, k.DELIVERS_SOUP :].sum(0) @ np.array(weights[k.DELIVERS_SOUP :]))
+        shares = [1.0 if value == worth else max(0.0, value) / worth for value in paid]
+        assert abs(deliveries - 12.0 * sum(shares)) < 1e-9, f"{deliveries} is paid for {paid}"
 
     def _count(self, events: np.ndarray, raw: np.ndarray, logged: dict[str, list[bool]], paid: list[float]) -> None:
         report = self.report
         report.steps += 1
         report.reward += sum(paid)
-        report.events += events.sum(0, dtype=int)
-        report.raw_events += raw.sum(0, dtype=int)
+        report.events = report.events + events.sum(0, dtype=int) if len(report.events) else events.sum(0, dtype=int)
+        report.raw_events = (
+            report.raw_events + raw.sum(0, dtype=int) if len(report.raw_events) else raw.sum(0, dtype=int)
+        )
         report.drops += sum(sum(logged[f"{name}_drop"]) for name in ("onion", "tomato", "dish", "soup"))
-        report.counter_pickups += int((raw & ~events & 1).sum())
-        report.unpaid += int(events[:, k.DELIVERS_SOUP].sum()) - sum(value > 0 for value in paid)
+        report.counter_pickups += int((raw & ~events & 1)[:, : k.DELIVERS_SOUP].sum())
+        report.unpaid += int(raw_event_vector(logged)[:, k.DELIVERS_SOUP].sum()) - sum(value > 0 for value in paid)
 
 
 def raw_event_vector(logged: dict[str, list[bool]]) -> np.ndarray:

@@ -57,11 +57,11 @@ def test_an_empty_hand_starts_a_pot_in_interact_mode_only():
 
 
 @pytest.mark.parametrize(("soup", "pays"), [((3, 0), 20), ((2, 0), 0), ((1, 0), 0)])
-def test_only_ordered_soups_pay_but_every_delivery_is_an_event(soup, pays):
+def test_only_soups_that_are_paid_for_are_events(soup, pays):
     env = kitchen("interact", cells=(6, 13), sides=(NORTH, SOUTH), held=(0, SOUP_CODE[soup]))
     batch = env.step(np.array([[STAY, INTERACT]]))
     assert batch.reward.tolist() == [pays] and batch.score.tolist() == [pays > 0]
-    assert batch.events[0].tolist() == [[0] * 5, [0, 0, 0, 0, 1]]
+    assert batch.events[0].tolist() == [[0] * 5, [0, 0, 0, 0, int(pays > 0)]]
     assert env.get_state()[0, k.HELD + 1] == 0
 
 

@@ -187,3 +187,111 @@ def test_a_start_state_is_where_episodes_begin():
     env.step(np.array([[0, 0]]))
     env.reset()
     assert env.render_text() == text
+
+
+def write_layout(tmp_path, **keys):
+    """A layout file with the good grid and the given keys, as the environment's name."""
+    path = tmp_path / "kitchen.layout"
+    path.write_text(repr({"grid": GOOD.replace("/", "\n"), **keys}))
+    return f"overcooked/{path}"
+
+
+def soup(*names):
+    return {"ingredients": list(names)}
+
+
+@pytest.mark.parametrize("orders", [[soup("onion", "onion")], [soup("onion")], [soup("tomato")] * 1])
+def test_a_kitchen_in_which_no_order_can_be_cooked_is_refused(tmp_path, orders):
+    name = write_layout(tmp_path, start_all_orders=orders)
+    with pytest.raises(UserError, match="no order can be cooked and paid.*cooking=interact") as caught:
+        make_env(name, cooking="auto")
+    assert "\n" not in str(caught.value)
+
+
+def test_worthless_orders_are_refused_too(tmp_path):
+    name = write_layout(tmp_path, start_all_orders=[soup("onion", "onion", "onion")], recipe_values=[0])
+    with pytest.raises(UserError, match="no order can be cooked and paid"):
+        make_env(name)
+
+
+def test_orders_that_cannot_be_cooked_are_named(tmp_path):
+    orders = [soup("onion", "onion", "onion"), soup("onion", "onion")]
+    name = write_layout(tmp_path, start_all_orders=orders)
+    assert make_env(name, cooking="auto").spec.notes == (
+        "orders that cannot be cooked here with cooking=auto are left out: onion + onion",
+    )
+    assert make_env(name, cooking="interact").spec.notes == ()
+    assert make_env("overcooked/cramped_room").spec.notes == ()
+
+
+@pytest.mark.parametrize(("old", "cooking"), [(True, "auto"), (False, "interact")])
+def test_a_file_says_how_pots_start(tmp_path, old, cooking):
+    name = write_layout(tmp_path, start_all_orders=ONIONS[2:], old_dynamics=old)
+    assert make_env(name).spec.params["cooking"] == cooking
+    again = make_env(name, **{k: v for k, v in make_env(name).spec.params.items() if k in ("cooking", "events")})
+    assert again.spec.fingerprint == make_env(name).spec.fingerprint
+    with pytest.raises(UserError, match=f"old_dynamics={old} means {cooking}"):
+        make_env(name, cooking="interact" if old else "auto")
+
+
+def test_old_dynamics_must_be_a_truth_value(tmp_path):
+    with pytest.raises(UserError, match="old_dynamics must be True or False"):
+        make_env(write_layout(tmp_path, old_dynamics="yes"))
+
+
+KEYS_OF_2019 = {"cook_time": 20, "num_items_for_soup": 3, "delivery_reward": 20, "rew_shaping_params": None}
+
+
+@pytest.mark.parametrize("orders", [None, ["onion"], ["any"], ["onion", "onion"]])
+def test_the_format_of_2019_is_read_as_what_it_is(tmp_path, orders):
+    env = make_env(write_layout(tmp_path, start_order_list=orders, **KEYS_OF_2019))
+    assert env.spec.params["cooking"] == "auto"
+    assert env.rules.reward[3, 0] == 20 and env.rules.cook_time[3, 0] == 20 and env.rules.reward[2, 0] == 0
+    assert (
+        env.spec.fingerprint
+        == make_env("overcooked/x", grid=GOOD, rules={"start_all_orders": ONIONS[2:]}).spec.fingerprint
+    )
+
+
+def test_soups_of_two_in_the_format_of_2019(tmp_path):
+    env = make_env(write_layout(tmp_path, start_order_list=["onion"], num_items_for_soup=2, cook_time=5))
+    assert env.rules.max_ingredients == 2 and env.rules.reward[2, 0] == 20 and env.rules.reward[1, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"start_order_list": ["leek"]}, "list of 'onion', 'tomato' and 'any'"),
+        ({"start_order_list": "onion"}, "list of 'onion', 'tomato' and 'any'"),
+        ({"start_order_list": None, "num_items_for_soup": 4}, "num_items_for_soup must be 1 to 3"),
+        ({"start_order_list": None, "start_all_orders": ONIONS[2:]}, "of different formats"),
+        ({"start_order_list": ["tomato"]}, "no order can be cooked and paid"),
+    ],
+)
+def test_mistakes_in_the_format_of_2019(tmp_path, keys, message):
+    with pytest.raises(UserError, match=message) as caught:
+        make_env(write_layout(tmp_path, **keys))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("word", "python"), [("null", "None"), ("true", "True"), ("false", "False")])
+def test_json_words_are_told_with_their_line(tmp_path, word, python):
+    path = tmp_path / "json.layout"
+    path.write_text(f'{{"grid": """{GOOD.replace("/", chr(10))}""",\n "unused": {word}}}')
+    with pytest.raises(UserError, match=f"line 5: {word}, write {python}"):
+        make_env(f"overcooked/{path}")
+
+
+def test_a_byte_order_mark_is_no_part_of_a_layout(tmp_path):
+    path = tmp_path / "bom.layout"
+    path.write_text("\ufeff" + repr({"grid": GOOD.replace("/", "\n")}), encoding="utf-8")
+    assert make_env(f"overcooked/{path}").spec.name == "overcooked/bom"
+
+
+def test_soups_of_different_worth_are_different_events(tmp_path):
+    """10 for one onion and 20 for three: half the weight of the dearest one."""
+    rules = {"start_all_orders": [ONIONS[0], ONIONS[2]], "recipe_values": [10, 20]}
+    spec = make_env("overcooked/x", grid=GOOD, rules=rules, cooking="interact").spec
+    assert spec.event_names[4:] == ("delivers_soup_worth_10", "delivers_soup_worth_20")
+    assert spec.event_weights == (1.0, 1.0, 1.0, 3.0, 6.0, 12.0)
+    assert make_env("overcooked/x", grid=GOOD, rules=rules).spec.event_names[4:] == ("delivers_soup",)

@@ -33,8 +33,9 @@ def test_play_is_that_of_overcooked_ai(layout, cooking):
 @pytest.mark.parametrize("cooking", MODES)
 def test_tomatoes_mixes_and_bonus_orders(cooking):
     report = Comparison("counter_circuit", cooking, seed=2).run(4000)
-    assert report.events.min() >= 10
-    # 10, 20 with bonus 40, and in interact mode 15 with bonus 30
+    assert report.events[: k.DELIVERS_SOUP].min() >= 5 and report.events[k.DELIVERS_SOUP :].sum() >= 4
+    # 47 and 55, and in interact mode 68 with its bonus
+    assert len(report.events) == (7 if cooking == "interact" else 6)
     assert report.reward > 0 and report.unpaid > 0
 
 
@@ -79,7 +80,7 @@ def test_the_game_that_is_made_of_an_environment_is_its_game(game, cooking):
     mdp = to_overcooked_mdp(OvercookedEnv(name, 1, cooking=cooking, **params))
     assert getattr(mdp, "old_dynamics", False) == (cooking == "auto")
     report = Comparison(name, cooking, 5, mdp=mdp, **params).run(3200)
-    assert report.events[k.POTS_INGREDIENT] > 10 and report.events[k.DELIVERS_SOUP] > 2
+    assert report.events[k.POTS_INGREDIENT] > 10 and report.events[k.DELIVERS_SOUP :].sum() > 2
 
 
 @pytest.mark.parametrize("horizon", [30, 400, 1000])

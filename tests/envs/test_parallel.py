@@ -145,3 +145,18 @@ def test_unknown_choices_are_user_errors(options, field):
 def test_a_batch_is_refused():
     with pytest.raises(UserError, match="num_envs"):
         PopgenParallelEnv(make_env("rendezvous/mppmr", 2))
+
+
+@pytest.mark.parametrize("action", [2.7, "2", None, np.float32(1.0), [1], np.array([1.5])])
+def test_an_action_that_is_no_whole_number_is_refused_and_not_cast(action):
+    env = parallel_env("overcooked/cramped_room")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="player_0 plays .* no whole number"):
+        env.step({"player_0": action, "player_1": 4})
+
+
+@pytest.mark.parametrize("action", [2, np.int64(2), np.uint8(2), np.array(2), np.array([2]), True])
+def test_every_integer_type_is_an_action(action):
+    env = parallel_env("overcooked/cramped_room")
+    env.reset(seed=0)
+    assert env.step({"player_0": action, "player_1": 4})[1]

@@ -63,6 +63,7 @@ def to_overcooked_mdp(env: OvercookedEnv) -> OvercookedGridworld:
         mdp = OvercookedGridworld.from_layout_name(layout.name)
     else:
         config = {"layout_name": layout.name, **layout.config}
+        config.pop("old_dynamics", None)  # the class below says it
         if config.get("start_state"):
             config["start_state"] = OvercookedState.from_dict(config["start_state"])
         mdp = OvercookedGridworld.from_grid(list(layout.rows), config)

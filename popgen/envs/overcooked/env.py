@@ -13,8 +13,8 @@ import numpy as np
 from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked import render
-from popgen.envs.overcooked.layout import load_layout
-from popgen.envs.overcooked.rules import resolve
+from popgen.envs.overcooked.layout import choose_cooking, load_layout
+from popgen.envs.overcooked.rules import check_orders, describe_left_out, resolve
 from popgen.envs.overcooked.start import possible_contents, start_row
 from popgen.envs.overcooked.tables import build_tables
 from popgen.errors import UserError
@@ -23,6 +23,7 @@ from popgen.types import StepBatch
 ACTION_NAMES = ("north", "south", "east", "west", "stay", "interact")
 EVENT_NAMES = ("takes_ingredient", "takes_dish", "pots_ingredient", "takes_soup", "delivers_soup")
 EVENT_WEIGHTS = (1.0, 1.0, 1.0, 3.0, 12.0)
+"""The paper's events and their weights (appendix D.2); the last is that of the dearest soup of a kitchen."""
 MAX_HORIZON = 65_535
 
 
@@ -49,7 +50,7 @@ class OvercookedEnv(BatchedEnv):
         num_envs: int = 1,
         *,
         seed: int = 0,
-        cooking: str = "auto",
+        cooking: str | None = None,
         events: str = "dispenser",
         horizon: int = 400,
         grid: str | None = None,
@@ -61,9 +62,10 @@ class OvercookedEnv(BatchedEnv):
             layout: name of a layout of overcooked_ai, or path of a .layout file; with `grid` only a label.
             num_envs: N.
             seed: ignored, see above.
-            cooking: `auto`, a full pot starts by itself; or `interact`, an empty-handed interact starts a pot.
+            cooking: `auto`, a full pot starts by itself; or `interact`, an empty-handed interact starts a pot. None
+                takes what a layout file says by `old_dynamics`, else `auto`.
             events: `dispenser` counts pick-ups at dispensers and pots only; `raw` as overcooked_ai logs them,
-                at counters too.
+                at counters too. In both, a soup that the game does not pay is neither picked up nor delivered.
             horizon: steps of an episode.
             grid: the layout as text, rows separated by newlines or '/'.
             rules: order and recipe keys of a layout file, for `grid`; without them every recipe is worth 20 and
@@ -72,19 +74,22 @@ class OvercookedEnv(BatchedEnv):
         Raises:
             UserError: any of these is wrong, or the layout cannot be played.
         """
-        _check_choice("env.cooking", cooking, ("auto", "interact"))
+        _check_choice("env.cooking", cooking, (None, "auto", "interact"))
         _check_choice("env.events", events, ("dispenser", "raw"))
         if isinstance(horizon, bool) or not isinstance(horizon, int) or not 1 <= horizon <= MAX_HORIZON:
             raise UserError("env.horizon", f"must be a whole number from 1 to {MAX_HORIZON}, got {horizon!r}")
         if num_envs < 1:
             raise UserError("num_envs", f"must be at least 1, got {num_envs}")
         self.layout = load_layout(layout, grid, rules)
-        self.rules = resolve(self.layout.config, "env.rules" if grid is not None else "env.layout")
+        cooking = choose_cooking(self.layout, cooking)
+        field = "env.rules" if grid is not None else "env.layout"
+        self.rules = resolve(self.layout.config, field)
         self.cooking, self.events, self.horizon = cooking, events, horizon
         self.num_envs = num_envs
         self._start = start_row(self.layout, self.rules)
         auto = cooking == "auto"
         contents, soups = possible_contents(self.layout, self.rules, self._start, auto)
+        check_orders(self.rules, soups, field)
         self.tables = build_tables(
             self.layout, self.rules, contents, soups, auto=auto, raw=events == "raw", horizon=horizon
         )
@@ -111,11 +116,27 @@ class OvercookedEnv(BatchedEnv):
             state_size=len(self._start),
             state_dtype="uint8",
             views=views,
-            event_names=EVENT_NAMES,
-            event_weights=EVENT_WEIGHTS,
+            event_names=self._event_names(),
+            event_weights=self._event_weights(),
             score_name="dishes",
             params=params,
             fingerprint=self._fingerprint(soups),
+            notes=describe_left_out(self.rules, soups, self.cooking),
+        )
+
+    def _event_names(self) -> tuple[str, ...]:
+        """One delivery event, or one for each sum that soups are worth where these differ."""
+        *others, delivery = EVENT_NAMES
+        worths = self.tables.worths
+        return (*others, delivery) if len(worths) == 1 else (*others, *(f"{delivery}_worth_{w:g}" for w in worths))
+
+    def _event_weights(self) -> tuple[float, ...]:
+        """Deliveries pay in proportion to what the game pays for the soup; a soup that it does not pay is no event."""
+        *others, delivery = EVENT_WEIGHTS
+        dearest = self.tables.worths[-1]  # infinite in one of overcooked_ai's own layouts
+        return (
+            *others,
+            *(delivery if worth == dearest else delivery * worth / dearest for worth in self.tables.worths),
         )
 
     def _lossless_view(self) -> ViewSpec:
@@ -174,7 +195,7 @@ class OvercookedEnv(BatchedEnv):
         batch = StepBatch(
             reward.reshape(lead),
             score.reshape(lead),
-            events.reshape(*lead, 2, k.NUM_EVENTS),
+            events.reshape(*lead, 2, self.spec.num_events),
             np.zeros(lead, bool),
             truncated.reshape(lead),
         )
@@ -269,7 +290,7 @@ class OvercookedEnv(BatchedEnv):
         """Step `states` in place; the results are new arrays, which callers may keep."""
         count = len(states)
         reward, score = np.empty(count, np.float32), np.empty(count, np.float32)
-        events, truncated = np.zeros((count, 2, k.NUM_EVENTS), np.uint8), np.empty(count, bool)
+        events, truncated = np.zeros((count, 2, self.spec.num_events), np.uint8), np.empty(count, bool)
         table, values, meta = self.tables.table, self.tables.values, self.tables.meta
         k.step(states.reshape(-1), states.shape[1], actions, table, values, meta, reward, score, events, truncated)
         return reward, score, events, truncated
@@ -289,8 +310,8 @@ class OvercookedEnv(BatchedEnv):
         return np.ascontiguousarray(actions, np.uint8)
 
 
-def _check_choice(field: str, value: Any, choices: tuple[str, ...]) -> None:
+def _check_choice(field: str, value: Any, choices: tuple[str | None, ...]) -> None:
     if value not in choices:
-        close = difflib.get_close_matches(str(value), choices, 1)
-        fix = f"did you mean {close[0]!r}?" if close else f"choose {' or '.join(choices)}"
+        close = difflib.get_close_matches(str(value), [choice for choice in choices if choice], 1)
+        fix = f"did you mean {close[0]!r}?" if close else f"choose {' or '.join(filter(None, choices))}"
         raise UserError(field, f"unknown value {value!r}", fix)

@@ -19,15 +19,16 @@ from numba import njit
 ORIENT, HELD, TIME, POTS = 2, 4, 6, 8
 # rows of the table
 NEXT, FACE, KIND, SLOT, ADD_ONION, ADD_TOMATO, COOK, FULL = 0, 4, 8, 9, 10, 11, 12, 13
-FLOOR, XFIRST, ITEM_BIT, POT_BIT, SOUP_ONIONS, SOUP_TOMATOES, POT_CELL, COUNTER_CELL, NUM_ROWS = (
-    14, 15, 16, 19, 22, 23, 24, 25, 26,
+FLOOR, XFIRST, ITEM_BIT, POT_BIT, SOUP_ONIONS, SOUP_TOMATOES, POT_CELL, COUNTER_CELL, DELIVERY, NUM_ROWS = (
+    14, 15, 16, 19, 22, 23, 24, 25, 26, 27,
 )  # fmt: skip
 # entries of meta
 M_POTS, M_COUNTERS, M_HORIZON, M_AUTO, M_RAW, M_FLOOR, M_ITEM, M_POT, M_COOK, M_FEATURES, M_CELLS, NUM_META = range(12)
 # kinds of cells
 WALL, COUNTER, ONIONS, TOMATOES, DISHES, POT, SERVE = range(7)
-# events
-TAKES_INGREDIENT, TAKES_DISH, POTS_INGREDIENT, TAKES_SOUP, DELIVERS_SOUP, NUM_EVENTS = range(6)
+# events; where soups are worth different sums, each worth has a delivery event of its own from DELIVERS_SOUP on
+TAKES_INGREDIENT, TAKES_DISH, POTS_INGREDIENT, TAKES_SOUP, DELIVERS_SOUP = range(5)
+UNPAID_DELIVERY, NO_EVENT = 254, 255
 # actions and objects
 STAY, INTERACT, NUM_ACTIONS = 4, 5, 6
 ONION, TOMATO, DISH, FIRST_SOUP = 1, 2, 3, 4
@@ -39,16 +40,22 @@ URGENT_BELOW = 40
 
 
 @njit(_nrt=False)
-def _counter_pickup_event(item):
+def _counter_pickup_event(item, table):
     """overcooked_ai's own log counts pick-ups from counters too."""
     if item == DISH:
         return TAKES_DISH
-    return TAKES_SOUP if item >= FIRST_SOUP else TAKES_INGREDIENT
+    return _soup_pickup_event(item, table) if item >= FIRST_SOUP else TAKES_INGREDIENT
+
+
+@njit(_nrt=False)
+def _soup_pickup_event(soup, table):
+    """A soup that the game does not pay for is no event: what it is worth is what training pays."""
+    return TAKES_SOUP if table[DELIVERY, soup] >= 0 else NO_EVENT
 
 
 @njit(_nrt=False)
 def _use_pot(states, held, slot, table, auto):
-    """Interact with the pot whose contents stand at `slot`; returns the event or NUM_EVENTS."""
+    """Interact with the pot whose contents stand at `slot`; returns the event or NO_EVENT."""
     item, contents, cooking = states[held], states[slot], states[slot + 1]
     if item == 0:
         if not auto and contents != 0 and cooking == 0:
@@ -58,19 +65,19 @@ def _use_pot(states, held, slot, table, auto):
             states[held] = contents
             states[slot] = 0
             states[slot + 1] = 0
-            return TAKES_SOUP
+            return _soup_pickup_event(contents, table)
     elif item < DISH and cooking == 0:
         mixed = table[ADD_ONION if item == ONION else ADD_TOMATO, contents]
         if mixed > 0:
             states[slot] = mixed
             states[held] = 0
             return POTS_INGREDIENT
-    return NUM_EVENTS
+    return NO_EVENT
 
 
 @njit(_nrt=False)
 def _interact(states, s, p, table, auto, raw):
-    """Resolve player p's interact in the state at states[s:]; returns the event it causes, or NUM_EVENTS."""
+    """Resolve player p's interact in the state at states[s:]; returns the event it causes, or NO_EVENT."""
     cell = table[FACE + (states[s + ORIENT + p] & 3), states[s + p]]
     kind, slot, held = table[KIND, cell], s + table[SLOT, cell], s + HELD + p
     item = states[held]
@@ -82,19 +89,19 @@ def _interact(states, s, p, table, auto, raw):
             states[held] = there
             states[slot] = item
             if raw and there != 0:
-                return _counter_pickup_event(there)
+                return _counter_pickup_event(there, table)
     elif kind == SERVE:
         if item >= FIRST_SOUP:
             states[held] = 0
-            return DELIVERS_SOUP
+            return table[DELIVERY, item] if table[DELIVERY, item] >= 0 else UNPAID_DELIVERY
     elif item == 0 and kind == DISHES:
         states[held] = DISH
         return TAKES_DISH
     elif item == 0 and kind != WALL:
         states[held] = ONION if kind == ONIONS else TOMATO
         # overcooked_ai 1.1.0 does not log tomatoes taken at a dispenser
-        return NUM_EVENTS if raw and kind == TOMATOES else TAKES_INGREDIENT
-    return NUM_EVENTS
+        return NO_EVENT if raw and kind == TOMATOES else TAKES_INGREDIENT
+    return NO_EVENT
 
 
 @njit(_nrt=False)
@@ -133,7 +140,7 @@ def step(states, size, actions, table, values, meta, reward, score, events, trun
         states: (N * S,) uint8, changed.  size: S.
         actions: (N, 2) uint8 below NUM_ACTIONS.
         table, values, meta: see tables.Tables.
-        reward, score: (N,) float32.  events: (N, 2, NUM_EVENTS) uint8, zeros.  truncated: (N,) bool.  All written.
+        reward, score: (N,) float32.  events: (N, 2, E) uint8, zeros.  truncated: (N,) bool.  All written.
     """
     auto, raw, pots, horizon = meta[M_AUTO] == 1, meta[M_RAW] == 1, meta[M_POTS], meta[M_HORIZON]
     for n in range(actions.shape[0]):
@@ -143,9 +150,9 @@ def step(states, size, actions, table, values, meta, reward, score, events, trun
             if actions[n, p] == INTERACT:
                 item = states[s + HELD + p]
                 event = _interact(states, s, p, table, auto, raw)
-                if event < NUM_EVENTS:
+                if event < UNPAID_DELIVERY:
                     events[n, p, event] = 1
-                if event == DELIVERS_SOUP:
+                if DELIVERS_SOUP <= event < NO_EVENT:
                     total += values[item]
                     paid += 1 if values[item] > 0 else 0
         _move(states, s, actions[n, 0], actions[n, 1], table)
@@ -170,7 +177,7 @@ def _set_item(out, at, other, item, table, bit_row):
 
 @njit(_nrt=False)
 def _player_features(states, s, table, meta, out, at, other):
-    """SamplerPool' part of both views, player 1's at out[at:] and player 2's at out[other:]; own entries first."""
+    """Players' part of both views, player 1's at out[at:] and player 2's at out[other:]; own entries first."""
     floor, items = meta[M_FLOOR], meta[M_ITEM]
     for player in range(2):
         mine, theirs = (at, other) if player == 0 else (other, at)

@@ -113,6 +113,22 @@ def load_layout(layout: str, grid: str | None = None, rules: Mapping[str, Any] |
     return made
 
 
+def choose_cooking(layout: Layout, cooking: str | None) -> str:
+    """How pots start: what is asked for, else what the layout's file says (`old_dynamics`), else by themselves.
+
+    Raises:
+        UserError: the two contradict each other.
+    """
+    old = layout.config.get("old_dynamics")
+    if old is not None and not isinstance(old, bool):
+        raise UserError("env.layout", f"old_dynamics must be True or False, got {old!r}", "correct it")
+    meant = None if old is None else "auto" if old else "interact"
+    if cooking is not None and meant is not None and cooking != meant:
+        problem = f"is {cooking}, but the layout's old_dynamics={old} means {meant}"
+        raise UserError("env.cooking", problem, f"leave it out, or set cooking={meant}")
+    return cooking or meant or "auto"
+
+
 def _layout_folder() -> Path | None:
     spec = importlib.util.find_spec("overcooked_ai_py")
     return Path(list(spec.submodule_search_locations)[0], "data", "layouts") if spec else None
@@ -137,7 +153,8 @@ def _from_file(layout: str) -> Layout:
         rows = _rows(config.pop("grid"))
     except (OSError, SyntaxError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError("env.layout", f"cannot read {path.name}: {reason}", "it must be a dict with a 'grid'") from None
+        fix = "write a dict with a 'grid', of Python's literals"
+        raise UserError("env.layout", f"cannot read {path.name}: {reason}", fix) from None
     return Layout(layout if named else path.stem, rows, rule_keys(config, "env.layout"), named)
 
 
@@ -150,8 +167,21 @@ class _Infinities(ast.NodeTransformer):
         return node
 
 
+_JSON_WORDS = {"null": "None", "true": "True", "false": "False"}
+
+
 def _literal(text: str) -> Any:
-    return ast.literal_eval(_Infinities().visit(ast.parse(text.strip(), mode="eval")))
+    """The value of a layout file, a literal of Python.
+
+    Raises:
+        ValueError: it holds anything else, such as JSON's own words, which the message names with their line.
+    """
+    tree = ast.parse(text.removeprefix("\ufeff").strip(), mode="eval")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and node.id != "float":
+            hint = f", write {_JSON_WORDS[node.id]}" if node.id in _JSON_WORDS else " is no literal"
+            raise ValueError(f"line {node.lineno}: {node.id}{hint}")
+    return ast.literal_eval(_Infinities().visit(tree))
 
 
 def _rows(text: str) -> tuple[str, ...]:

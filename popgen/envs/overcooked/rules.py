@@ -32,7 +32,9 @@ _RECIPE_KEYS = (
     "recipe_values", "recipe_times", "delivery_reward", "cook_time", "max_num_ingredients",
     "onion_value", "tomato_value", "onion_time", "tomato_time",
 )  # fmt: skip
-_IGNORED_KEYS = ("rew_shaping_params", "layout_name", "num_items_for_soup", "old_dynamics", "unused")
+_COOKING_KEYS = ("old_dynamics",)
+_KEYS_OF_2019 = ("start_order_list", "num_items_for_soup")
+_IGNORED_KEYS = ("rew_shaping_params", "layout_name", "num_items_for_soup", "unused")
 _CLASHES = (
     ("tomato_value", "delivery_reward"), ("tomato_value", "recipe_values"), ("recipe_values", "delivery_reward"),
     ("tomato_time", "cook_time"), ("tomato_time", "recipe_times"), ("recipe_times", "cook_time"),
@@ -41,11 +43,13 @@ _CLASHES = (
 
 @dataclass(frozen=True)
 class Rules:
-    """Resolved recipe rules: `reward` and `cook_time` per (onions, tomatoes), and what a full pot holds."""
+    """Resolved recipe rules: `reward` and `cook_time` per (onions, tomatoes), what a full pot holds, and the soups that
+    the layout itself names as orders."""
 
     reward: dict[tuple[int, int], float]
     cook_time: dict[tuple[int, int], int]
     max_ingredients: int
+    ordered: tuple[tuple[int, int], ...] = ()
 
     def pot_contents(
         self, onions: bool, tomatoes: bool, initial: Iterable[tuple[int, int]] = ()
@@ -70,14 +74,67 @@ def rule_keys(config: Mapping[str, Any], field: str) -> dict[str, Any]:
     Raises:
         UserError: a key that no layout file has.
     """
-    known = _ORDER_KEYS + _RECIPE_KEYS
+    known = _ORDER_KEYS + _RECIPE_KEYS + _COOKING_KEYS
     if not isinstance(config, Mapping):
         raise UserError(field, f"rules must be a mapping, got {type(config).__name__}", "write key: value")
+    if "start_order_list" in config:
+        config = translate_2019(config, field)
     for key in config:
         if key not in known + _IGNORED_KEYS:
             close = difflib.get_close_matches(str(key), known, 1)
             raise UserError(field, f"unknown key {key!r}", f"did you mean {close[0]!r}?" if close else "remove it")
     return {key: config[key] for key in known if key in config}
+
+
+def translate_2019(config: Mapping[str, Any], field: str) -> dict[str, Any]:
+    """The rule keys of a layout file in overcooked_ai's format of 2019, in which a soup has one kind of ingredient.
+
+    There, `start_order_list` names ingredients ("onion" is a soup of `num_items_for_soup` onions) or is None, which
+    takes any soup, and a full pot cooks by itself. A list's order of delivery is not kept: each of its soups is paid
+    at any time.
+
+    Raises:
+        UserError: an order or a size that the format does not know, or keys of both formats.
+    """
+    both = sorted(set(config) & set(_ORDER_KEYS))
+    if both:
+        raise UserError(field, f"start_order_list and {both[0]} are of different formats", "remove one of them")
+    size, orders = config.get("num_items_for_soup", MAX_INGREDIENTS), config["start_order_list"]
+    if isinstance(size, bool) or size not in range(1, MAX_INGREDIENTS + 1):
+        raise UserError(field, f"num_items_for_soup must be 1 to {MAX_INGREDIENTS}, got {size!r}")
+    kinds = ("onion", "tomato")
+    if orders is not None and not (isinstance(orders, list | tuple) and set(orders) <= {*kinds, "any"}):
+        problem = f"start_order_list must be None or a list of 'onion', 'tomato' and 'any', got {orders!r}"
+        raise UserError(field, problem, "correct it")
+    paid = [kind for kind in kinds if not orders or "any" in orders or kind in orders]
+    others = {key: value for key, value in config.items() if key not in _KEYS_OF_2019}
+    return others | {
+        "start_all_orders": [{"ingredients": [kind] * size} for kind in paid],
+        "max_num_ingredients": size,
+        "old_dynamics": config.get("old_dynamics", True),
+    }
+
+
+def check_orders(rules: Rules, soups: list[tuple[int, int]], field: str) -> None:
+    """Some soup that can be cooked must be paid for, or a whole training earns nothing.
+
+    Raises:
+        UserError: none is.
+    """
+    if not any(rules.reward.get(soup, 0.0) > 0.0 for soup in soups):
+        sizes = sorted({sum(soup) for soup in soups})
+        problem = f"no order can be cooked and paid: soups here have {' or '.join(map(str, sizes))} ingredients"
+        fix = "choose env.params.cooking=interact for smaller soups, or correct the orders, values and dispensers"
+        raise UserError(field, problem, fix)
+
+
+def describe_left_out(rules: Rules, soups: list[tuple[int, int]], cooking: str) -> tuple[str, ...]:
+    """A sentence about ordered soups that this kitchen cannot cook; none if there are none."""
+    missing = [soup for soup in rules.ordered if rules.reward[soup] > 0.0 and soup not in soups]
+    if not missing:
+        return ()
+    names = ", ".join(" + ".join(["onion"] * onions + ["tomato"] * tomatoes) for onions, tomatoes in missing)
+    return (f"orders that cannot be cooked here with cooking={cooking} are left out: {names}",)
 
 
 def resolve(config: Mapping[str, Any], field: str) -> Rules:
@@ -101,6 +158,7 @@ def resolve(config: Mapping[str, Any], field: str) -> Rules:
     orders = list(_recipes((start.get("all_orders") if start else config.get("start_all_orders")) or [], field))
     bonus = list(_recipes((start.get("bonus_orders") if start else config.get("start_bonus_orders")) or [], field))
     soups = [soup for soup in SOUPS if sum(soup) <= size]
+    ordered = tuple(soup for soup in orders if soup in soups)
     orders = orders or soups
     for name, listed in (("start_all_orders", orders), ("start_bonus_orders", bonus)):
         if len(set(listed)) != len(listed):
@@ -113,7 +171,7 @@ def resolve(config: Mapping[str, Any], field: str) -> Rules:
         value = _figure(config, soup, named, "delivery_reward", "recipe_values", "value")
         reward[soup] = float(value * (factor if soup in bonus else 1)) if soup in orders else 0.0
         cook_time[soup] = _cook_time(_figure(config, soup, named, "cook_time", "recipe_times", "time"), field)
-    return Rules(reward, cook_time, size)
+    return Rules(reward, cook_time, size, ordered)
 
 
 def _check_types(config: Mapping[str, Any], field: str) -> None:

@@ -24,6 +24,7 @@ class Tables:
     Attributes:
         table: (k.NUM_ROWS, 256) int16, see the row names in kernels.py.
         values: (256,) float32, joint reward for delivering each object code.
+        worths: the distinct sums above 0 that soups of this kitchen pay, ascending; each has a delivery event.
         meta: (k.NUM_META,) int64, sizes and switches.
         codes: (4, 512) int16, inverse of the feature bits: object codes by held/counter bits (row 0) and by pot
             bits (row 1), cell index by walkable feature (row 2), x-first index by cell (row 3).
@@ -34,6 +35,7 @@ class Tables:
 
     table: np.ndarray
     values: np.ndarray
+    worths: tuple[float, ...]
     meta: np.ndarray
     codes: np.ndarray
     walls: np.ndarray
@@ -65,9 +67,7 @@ def build_tables(
     pots, counters = layout.usable("P"), layout.usable("X")
     _fill_cells(table, layout, pots, counters)
     _fill_recipes(table, rules)
-    values = np.zeros(256, np.float32)
-    for soup, reward in rules.reward.items():
-        values[SOUP_CODE[soup]] = reward
+    values, worths = _fill_worths(table, rules, soups)
 
     ingredients = [code for mark, code in (("O", k.ONION), ("T", k.TOMATO)) if layout.usable(mark)]
     codes = np.zeros((4, 512), np.int16)
@@ -84,7 +84,7 @@ def build_tables(
     meta[k.M_FLOOR], meta[k.M_ITEM], meta[k.M_POT], meta[k.M_COOK] = len(floor), len(item_names), len(pot_names), cook
     names = _names(floor, item_names, pots, pot_names, cook, counters)
     meta[k.M_FEATURES], meta[k.M_CELLS] = len(names), layout.width * layout.height
-    return Tables(table, values, meta, codes, _lossless_walls(layout), counters, pots, names)
+    return Tables(table, values, worths, meta, codes, _lossless_walls(layout), counters, pots, names)
 
 
 def _cell(layout: Layout, cell: tuple[int, int]) -> int:
@@ -125,6 +125,18 @@ def _fill_recipes(table: np.ndarray, rules: Rules) -> None:
         else:
             table[k.ADD_ONION, code] = SOUP_CODE[onions + 1, tomatoes]
             table[k.ADD_TOMATO, code] = SOUP_CODE[onions, tomatoes + 1]
+
+
+def _fill_worths(table: np.ndarray, rules: Rules, soups: list[tuple[int, int]]) -> tuple[np.ndarray, tuple[float, ...]]:
+    """What each object code pays, and the delivery event of each soup that pays; -1 in the table stands for none."""
+    values = np.zeros(256, np.float32)
+    for soup, reward in rules.reward.items():
+        values[SOUP_CODE[soup]] = reward
+    worths = tuple(sorted({float(rules.reward[soup]) for soup in soups if rules.reward.get(soup, 0.0) > 0.0}))
+    for soup in soups:
+        if rules.reward.get(soup, 0.0) > 0.0:
+            table[k.DELIVERY, SOUP_CODE[soup]] = k.DELIVERS_SOUP + worths.index(float(rules.reward[soup]))
+    return values, worths
 
 
 def _tests(items_too: bool) -> list[tuple[str, list[bool]]]:
