@@ -1,0 +1,254 @@
+"""The contract between training loops and operations.
+
+A training loop is a generator of records: what it does next (`Phase`), what happened (`Progress`, `Round`), what came of
+it (`TrainedMember`). It writes no file, counts no step in a ledger and prints nothing. One driver for all methods
+(`popgen.pipelines.population`) iterates over it, hands each record to the recorder and the reporter, and makes a
+checkpoint at a `Round` with `at_rest`. The driver answers a `Round` with True where it wants a checkpoint and the round
+was not at rest: the loop then comes to rest soon and yields a `Round` that is.
+
+    training = method.open_training(...)          # workers of one attempt
+    training.adopt(weights, left)                 # members that are trained already
+    members = training.begin(first)               # fresh networks for the members that learn together from `first` on
+    training.restore(checkpoint)                  # only where there is one of these members
+    for record in training.train(): ...           # ends with a `TrainedMember` for each of `members`
+    training.close()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
+from popgen.nets.weights import Weights
+from popgen.play.policy import Policy
+from popgen.play.sampler import Episode
+from popgen.types import Kind, Segment
+
+State = dict[str, Any]
+"""Nested dictionaries of arrays and plain values, as `popgen.runs.state_files` writes them. In a checkpoint a `Pending`
+may stand in for a value: the process that writes the files resolves it, so that bulk data does not pass the driver."""
+
+Figures = Mapping[str, float]
+
+T = TypeVar("T", covariant=True)
+
+
+class Pending(Protocol[T]):
+    """A handle of work that may still be going on: in this process or elsewhere."""
+
+    def result(self) -> T:
+        """Wait for it; raises what the work raised."""
+
+
+# ---- environment steps -----------------------------------------------------------------------------------------------
+
+
+class SegmentCount(NamedTuple):
+    """What the ledger needs of one segment: its match, running number and environment steps."""
+
+    kind: Kind
+    members: tuple[int, int]
+    sequence: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What the ledger and the loop need of one call of a sampler, beside the segments themselves.
+
+    Attributes:
+        sampler: its name, unique to the run's attempt.
+        counts: one entry per segment.
+        episodes: those that ended.
+        cpu_seconds: of the sampler.
+    """
+
+    sampler: str
+    counts: list[SegmentCount]
+    episodes: list[Episode]
+    cpu_seconds: float = 0.0
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the call."""
+        return sum(count.steps for count in self.counts)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Real steps of one call of a sampler.
+
+    Attributes:
+        collected: their counts.
+        segments: the segments themselves, in parts, for the checkpoint's log; empty where a checkpoint needs no log.
+    """
+
+    collected: Collected
+    segments: tuple[Pending[list[Segment]], ...] = ()
+
+
+@dataclass(frozen=True)
+class StepCount:
+    """Steps that no sampler of ours took: of an exact simulator, of RLlib's runners. One entry of the ledger."""
+
+    member: int
+    kind: Kind
+    sampler: str
+    sequence: int
+    steps: int
+    episodes: int
+    score: float = 0.0
+
+
+# ---- records of a loop -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Something new begins; `total` is its amount of work in any unit, which `Progress.done` counts."""
+
+    name: str
+    total: float
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What happened since the last record; everything but `member` and `steps` may be absent.
+
+    Attributes:
+        member: whose training it is.
+        steps: this member's environment steps so far, the horizontal axis of its metrics.
+        figures: one point of metrics, checked to be finite where `learners` names their first part (`model/loss`).
+        sampled: real steps, for the ledger and the checkpoint's log.
+        counted: other steps, for the ledger.
+        done: of the phase's total.
+        shown: figures of the progress line.
+        note: a line for the user.
+    """
+
+    member: int
+    steps: int
+    figures: Figures = field(default_factory=dict)
+    sampled: tuple[Sampled, ...] = ()
+    counted: tuple[StepCount, ...] = ()
+    done: float | None = None
+    shown: Mapping[str, float | int | str] = field(default_factory=dict)
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Round(Progress):
+    """A round has ended.
+
+    Attributes:
+        number: rounds of this member that have ended.
+        at_rest: nothing is at work, so that a checkpoint may be made.
+        must_save: a checkpoint is made whatever the time since the last one.
+    """
+
+    number: int = 0
+    at_rest: bool = True
+    must_save: bool = False
+
+
+@dataclass(frozen=True)
+class TrainedMember:
+    """A member is complete.
+
+    Attributes:
+        policy: as it is saved and acts.
+        training: further weights that are kept beside it.
+        seed: of its training.
+        extra: figures for its record.
+        left: what it leaves behind for the members after it, see `Training.adopt`.
+        note: a line for the user.
+    """
+
+    member: int
+    policy: Policy
+    training: Weights | None
+    seed: int
+    extra: dict[str, Any]
+    left: State = field(default_factory=dict)
+    note: str = ""
+
+
+Record = Phase | Progress | TrainedMember
+Loop = Generator[Record, bool | None, None]
+
+
+# ---- what the driver asks of a method --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint of running members, as it is read.
+
+    Attributes:
+        state: what `Training.checkpoint` gave.
+        buffers: the last whole copy that `Training.buffers` gave, None if there is none: they start empty.
+        log: segments (with the member they were played for) that came after that copy, in order.
+    """
+
+    state: State
+    buffers: State | None = None
+    log: Iterator[tuple[Pending[list[Segment]], int]] = field(default_factory=lambda: iter(()))
+
+
+class Training(Protocol):
+    """The training of one run's members in one attempt: workers, and the loop that they work for.
+
+    Attributes:
+        learners: first parts of figures' names (`model/loss`) that must be finite: a learner does not recover.
+        log_rows: rows in the log from which on a whole copy of the buffers is written.
+    """
+
+    learners: tuple[str, ...]
+    log_rows: int
+
+    def adopt(self, weights: dict[int, Weights], left: State) -> None:
+        """Take over finished members: their acting weights, and what the last of them left behind ({} if nothing)."""
+
+    def first_of_group(self, member: int) -> int:
+        """The first of the members that learn together with `member`: itself where they learn one after the other."""
+
+    def begin(self, first: int) -> tuple[int, ...]:
+        """Begin with the members that learn together from `first` on; who they are."""
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Continue where `checkpoint` was made; after `begin`.
+
+        Raises:
+            LookupError, TypeError, ValueError: a part is missing or does not fit.
+        """
+
+    def train(self) -> Loop:
+        """The records from here to the last member that `begin` named.
+
+        Raises:
+            FloatingPointError: training diverged.
+        """
+
+    def checkpoint(self) -> State:
+        """Everything that `restore` needs; asked for at rest."""
+
+    def buffers(self) -> State:
+        """Whole copies of the buffers, for a log that has become long; {} where a checkpoint needs no log."""
+
+    def close(self) -> None:
+        """End all workers."""
+
+
+class OpenTraining(Protocol):
+    """What a method gives: the start of its workers.
+
+    Args:
+        config: of the run.
+        spec: of its environment.
+        attempt: unique to the run's attempt; part of the samplers' names in the ledger.
+    """
+
+    def __call__(self, config: RunConfig, spec: EnvSpec, attempt: str) -> Training: ...
