@@ -1,0 +1,120 @@
+"""Hold-out figures against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from popgen.evaluation import holdout_metrics as metrics
+from popgen.evaluation.holdout_metrics import (
+    bootstrap_interval,
+    choose_most_diverse,
+    describe_spread,
+    find_worst,
+    interquartile_mean,
+    measure_br_proximity,
+    measure_cvar,
+    measure_diversity,
+    measure_regret,
+    normalise_returns,
+)
+
+MEANS = np.array([[[2.0, 4.0], [9.0, 0.0]]])  # one ego, two partners, two seats
+BEST = np.array([[4.0, 8.0], [6.0, 0.0]])
+
+
+def test_mean_sd_and_se_have_their_names() -> None:
+    spread = describe_spread(np.array([[1.0, 2.0], [3.0, 6.0]]))  # deviations -2 -1 0 3: 14 / 3
+    assert (spread.mean, spread.count) == (3.0, 4)
+    assert spread.sd == pytest.approx(math.sqrt(14 / 3)) and spread.se == pytest.approx(math.sqrt(14 / 3) / 2)
+    assert math.isnan(describe_spread(np.array([5.0])).se)
+
+
+def test_br_prox_clipped_and_not() -> None:
+    assert measure_br_proximity(MEANS, BEST).tolist() == [[[0.5, 0.5], [1.0, 1.0]]]
+    unclipped = measure_br_proximity(MEANS, BEST, clip=False)
+    assert unclipped[0, 1, 0] == 1.5 and math.isnan(unclipped[0, 1, 1])
+
+
+def test_regret_worst_and_normalised_return() -> None:
+    assert measure_regret(MEANS, BEST).tolist() == [[[2.0, 4.0], [-3.0, 0.0]]]
+    assert find_worst(MEANS).tolist() == [0.0]
+    assert normalise_returns(MEANS, 1.0, np.array([[5.0, 5.0], [5.0, 5.0]])).tolist() == [[[0.25, 0.75], [2.0, -0.25]]]
+    with pytest.raises(ValueError, match="above low"):
+        normalise_returns(MEANS, 0.0, BEST)
+
+
+@pytest.mark.parametrize(
+    ("share", "value"), [(0.25, 1.0), (0.5, 1.5), (1.0, 2.5), (0.1, 1.0), (0.375, (1 + 0.5 * 2) / 1.5)]
+)
+def test_cvar_is_the_mean_of_the_lowest_share(share: float, value: float) -> None:
+    assert measure_cvar(np.array([4.0, 2.0, 1.0, 3.0]), share) == pytest.approx(value)
+
+
+def test_the_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
+    assert interquartile_mean(np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])) == 3.5  # 2 3 4 5
+
+
+def test_the_interval_holds_the_estimate_and_is_seeded() -> None:
+    scores = np.random.default_rng(0).normal(5.0, 1.0, (5, 12))
+    first, again = bootstrap_interval(scores, seed=1), bootstrap_interval(scores, seed=1)
+    assert first == again and first.low < first.value < first.high
+    wider = bootstrap_interval(np.concatenate([scores - 3, scores + 3]), seed=1)
+    assert wider.high - wider.low > first.high - first.low
+    assert bootstrap_interval(np.full((3, 4), 2.0)).low == 2.0 == bootstrap_interval(np.full((3, 4), 2.0)).high
+
+
+def test_runs_are_resampled_within_tasks() -> None:
+    """Tasks differ widely, runs not at all: without resampling tasks there is no spread."""
+    scores = np.tile(np.arange(8.0) * 10, (4, 1))
+    fixed = bootstrap_interval(scores, lambda sample: float(sample.mean()))
+    assert (fixed.low, fixed.value, fixed.high) == (35.0, 35.0, 35.0)
+    free = bootstrap_interval(scores, lambda sample: float(sample.mean()), over_tasks=True)
+    assert free.low < 30 and free.high > 40
+
+
+def test_one_run_has_no_interval_over_runs() -> None:
+    with pytest.raises(ValueError, match="over_tasks"):
+        bootstrap_interval(np.ones((1, 4)))
+    assert bootstrap_interval(np.array([[1.0, 2.0, 3.0, 4.0]]), over_tasks=True).value == 2.5
+
+
+def test_br_div_of_orthogonal_and_of_equal_partners() -> None:
+    orthogonal = measure_diversity(np.eye(3) * 5)
+    scale = 5 / (5 + 1e-3)
+    assert orthogonal.determinant == pytest.approx(scale**6) and orthogonal.effective_rank == pytest.approx(3.0)
+    equal = measure_diversity(np.array([[1.0, 2.0], [1.0, 2.0]]))
+    assert equal.determinant == pytest.approx(0.0, abs=1e-12) and equal.effective_rank == pytest.approx(1.0)
+
+
+def test_the_effective_rank_of_two_eigenvalues() -> None:
+    """Columns 1 and 0.5: the Gram matrix of rows (1, 1) and (1, 0) has trace 3 and determinant 1, margins aside."""
+    diversity = measure_diversity(np.array([[1e6, 1e6], [1e6, 0.0]]))
+    values = np.array([(3 + math.sqrt(5)) / 2, (3 - math.sqrt(5)) / 2]) / 3
+    assert diversity.determinant == pytest.approx(1.0, rel=1e-6)
+    assert diversity.effective_rank == pytest.approx(math.exp(-(values * np.log(values)).sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("limit", [10**9, 0])
+def test_the_most_diverse_are_found_with_and_without_trying_all(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
+    events = np.abs(np.random.default_rng(3).normal(size=(9, 6)))
+    events[4] = events[2] * 1.001  # a near copy must not be chosen beside its model
+    everything = choose_most_diverse(events, 4)
+    monkeypatch.setattr(metrics, "EXHAUSTIVE", limit)
+    chosen = choose_most_diverse(events, 4)
+    assert chosen == everything == sorted(chosen) and not {2, 4} <= set(chosen)
+
+
+def test_bad_arguments_are_refused() -> None:
+    for call in (
+        lambda: measure_cvar(np.ones(3), 0.0),
+        lambda: measure_br_proximity(MEANS, BEST[:1]),
+        lambda: bootstrap_interval(np.ones(4)),
+        lambda: measure_diversity(np.array([[-1.0]])),
+        lambda: choose_most_diverse(np.eye(3), 4),
+        lambda: describe_spread(np.array([])),
+    ):
+        with pytest.raises(ValueError):
+            call()
