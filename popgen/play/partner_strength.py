@@ -1,47 +1,124 @@
-"""What a member's real cross-play says about each partner: the strongest one is trained against."""
+"""How strong each partner is in real cross-play, and whom a member is trained against."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
+Rule = Literal["max_window", "max_buffer", "max_latest"]
+
 
 class PartnerStrength:
-    """Real returns by partner, from the episodes of B_XP that one member was in.
+    """Real returns (and scores) by partner, from the cross-play episodes that one member was in, in both seatings.
 
-    rule: `max_window` knows a partner by the mean of its latest window, the episodes last added; `max_buffer` by the
-    mean of all. A partner without episodes has no score: it counts as not seen yet.
+    A partner without episodes has no strength: it counts as not seen yet.
+
+    Args:
+        rule: `max_window` knows a partner by the mean of the episodes last added, `max_buffer` by the mean of all that
+            were, `max_latest` by the mean of the latest `window`.
+        window: episodes remembered of each partner under `max_latest`; None remembers all since `forget`.
     """
 
-    def __init__(self, rule: Literal["max_window", "max_buffer"]) -> None:
-        self.rule = rule
-        self._windows: dict[int, list[float]] = {}
+    def __init__(self, rule: Rule, window: int | None = None) -> None:
+        self.rule, self.window = rule, window
+        self.returns: dict[int, deque[float]] = {}
+        self._scores: dict[int, deque[float]] = {}
         self._sums: dict[int, list[float]] = {}
 
-    def add(self, partner: int, returns: Sequence[float]) -> None:
-        """A window of episodes with `partner`; an empty one says nothing."""
+    def add(self, partner: int, returns: Sequence[float], scores: Sequence[float] = ()) -> None:
+        """Episodes with `partner`: their returns and, where somebody asks for `mean_scores`, their scores."""
         if not len(returns):
             return
-        self._windows[partner] = [float(value) for value in returns]
-        total, count = self._sums.get(partner, [0.0, 0])
-        self._sums[partner] = [total + float(np.sum(returns)), count + len(returns)]
+        if self.rule == "max_window":
+            self.forget(partner)
+        self._remember(self.returns, partner, returns)
+        self._remember(self._scores, partner, scores)
+        if self.rule == "max_buffer":
+            total, count = self._sums.get(partner, [0.0, 0])
+            self._sums[partner] = [total + float(np.sum(returns)), count + len(returns)]
+            self.forget(partner)
+
+    def _remember(self, memory: dict[int, deque[float]], partner: int, values: Iterable[float]) -> None:
+        memory.setdefault(partner, deque(maxlen=self.window)).extend(float(value) for value in values)
+
+    def forget(self, partner: int) -> None:
+        """Only episodes from now on count; the sums of `max_buffer` stay."""
+        self.returns.pop(partner, None)
+        self._scores.pop(partner, None)
 
     def scores(self) -> dict[int, float]:
-        """Mean return of every partner seen."""
-        if self.rule == "max_window":
-            return {partner: float(np.mean(window)) for partner, window in self._windows.items()}
-        return {partner: total / count for partner, (total, count) in self._sums.items()}
+        """Strength, the mean return, of every partner seen."""
+        if self.rule == "max_buffer":
+            return {partner: total / count for partner, (total, count) in self._sums.items()}
+        return _means(self.returns)
+
+    def mean_scores(self) -> dict[int, float]:
+        """Partner -> mean score of the episodes remembered, of those that have some."""
+        return _means(self._scores)
 
     def state(self) -> dict[str, Any]:
         """JSON-able."""
         return {
-            "windows": {str(partner): window for partner, window in self._windows.items()},
-            "sums": {str(partner): sums for partner, sums in self._sums.items()},
+            "returns": {str(partner): list(values) for partner, values in self.returns.items()},
+            "scores": {str(partner): list(values) for partner, values in self._scores.items()},
+            "sums": {str(partner): list(sums) for partner, sums in self._sums.items()},
         }
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`."""
-        self._windows = {int(partner): list(window) for partner, window in state["windows"].items()}
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Replace the contents with `state()`."""
+        self.returns, self._scores = {}, {}
+        for memory, name in ((self.returns, "returns"), (self._scores, "scores")):
+            for partner, values in state[name].items():
+                self._remember(memory, int(partner), values)
         self._sums = {int(partner): list(sums) for partner, sums in state["sums"].items()}
+
+
+def _means(memory: Mapping[int, deque[float]]) -> dict[int, float]:
+    return {partner: float(np.mean(values)) for partner, values in memory.items() if values}
+
+
+def strongest_partner(
+    partners: Collection[int], strength: Mapping[int, float], unseen: Mapping[int, float] | None = None
+) -> int:
+    """The partner of the highest strength, the lowest number of equals; one that has none yet comes first.
+
+    Args:
+        partners: to choose from.
+        strength: partner -> `PartnerStrength.scores`.
+        unseen: which of those without strength leads; one that is not in it comes before those that are.
+
+    Raises:
+        ValueError: there are no partners.
+    """
+    members, guesses = sorted(partners), unseen or {}
+    if new := [k for k in members if k not in strength]:
+        return max(new, key=lambda k: guesses.get(k, float("inf")))
+    return max(members, key=lambda k: strength[k])
+
+
+def any_or_strongest(
+    partners: Collection[int],
+    strength: Mapping[int, float],
+    random_share: float,
+    rng: np.random.Generator,
+    unseen: Mapping[int, float] | None = None,
+) -> int:
+    """The strongest, or now and then any: so every partner's critic and estimate stay fresh.
+
+    The second number is drawn only where any partner is to be chosen.
+    """
+    if rng.random() < random_share:
+        return int(rng.choice(sorted(partners)))
+    return strongest_partner(partners, strength, unseen)
+
+
+def any_then_strongest(
+    partners: Collection[int], strength: Mapping[int, float], random_share: float, rng: np.random.Generator
+) -> int:
+    """`any_or_strongest` of the baselines, which draw both numbers every time: their generator's place does not depend
+    on what is chosen."""
+    candidate = int(rng.choice(sorted(partners)))
+    return candidate if rng.random() < random_share else strongest_partner(partners, strength)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv
+from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
 from popgen.play.seating import Seating
 from popgen.shapes import check
@@ -35,29 +36,12 @@ class Transition:
     counted: np.ndarray
 
 
-@dataclass(frozen=True)
-class Episodes:
-    """N full episodes, one per row. Score, reward and shaped return are different figures.
-
-    Attributes:
-        seats: (N, P) int, index of the policy in each seat.
-        score: (N,) float64, sum of the environment's score (dishes in Overcooked).
-        reward: (N,) float64, sum of the environment's own reward.
-        events: (N, P, E) int64, how often each player caused each event.
-        shaped: (N, P) float64, the events weighted by `EnvSpec.event_weights`, per seat.
-        length: (N,) int64, steps of the episode.
-        terminated: (N,) bool, the task ended before the horizon.
-        steps: environment steps taken in all, those of rows that waited for longer episodes included.
-    """
-
-    seats: np.ndarray
-    score: np.ndarray
-    reward: np.ndarray
-    events: np.ndarray
-    shaped: np.ndarray
-    length: np.ndarray
-    terminated: np.ndarray
-    steps: int
+def take_step(env: BatchedEnv, seating: Seating) -> Transition:
+    """All players act and the environment answers; the caller resets finished rows and tells `seating.ended`."""
+    states, is_first = env.get_state(), seating.is_first
+    actions = seating.act({view: env.encode(states, view) for view in seating.views})
+    result = env.step(actions)
+    return Transition(states, env.get_state(), actions, result, is_first, np.ones(len(states), bool))
 
 
 def play(
@@ -90,11 +74,10 @@ def play(
     events = np.zeros((batch, spec.num_players, spec.num_events), np.int64)
     open_, terminated, steps = np.ones(batch, bool), np.zeros(batch, bool), 0
     while open_.any():
-        states, is_first = (env.get_state(), seating.is_first) if record else (None, None)
-        actions = seating.act({view: env.observe(view) for view in seating.views})
-        result = env.step(actions)
+        step = take_step(env, seating)
+        result = step.result
         if record:
-            record(Transition(states, env.get_state(), actions, result, is_first, open_.copy()))
+            record(replace(step, counted=open_.copy()))
         score += np.where(open_, result.score, 0.0)
         reward += np.where(open_, result.reward, 0.0)
         events += result.events * open_[:, None, None]
@@ -138,10 +121,4 @@ def play_teams(
         parts.append(play(make(len(seats), 0), policies, seats, seed=int(part_seed >> 1)))
         if progress:
             progress(start + len(seats), len(rows))
-    return _join(parts)
-
-
-def _join(parts: Sequence[Episodes]) -> Episodes:
-    names = [field.name for field in fields(Episodes) if field.name != "steps"]
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Episodes(**arrays, steps=sum(part.steps for part in parts))
+    return Episodes.concat(parts)

@@ -2,53 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv
+from popgen.play.episodes import Episode
+from popgen.play.matches import Match, columns_of, match_of_columns
 from popgen.play.policy import Policy
+from popgen.play.rollout import take_step
 from popgen.play.seating import Seating
-from popgen.types import Kind, Segment
-
-
-@dataclass(frozen=True)
-class Match:
-    """`envs` environments in which `members` (seat 0, seat 1) play; the steps count as `kind`."""
-
-    kind: Kind
-    members: tuple[int, int]
-    envs: int
-
-
-def split_matches(matches: list[Match], parts: int) -> list[list[Match]]:
-    """Cut the batch of environments that the matches fill into `parts`, as even as possible and in order.
-
-    Sizes differ by one at most, the larger ones first; with fewer environments than parts the last ones are empty.
-    """
-    total = sum(match.envs for match in matches)
-    bounds = np.cumsum([0] + [total // parts + (part < total % parts) for part in range(parts)])
-    shares: list[list[Match]] = [[] for _ in range(parts)]
-    begin = 0
-    for match in matches:
-        end = begin + match.envs
-        for share, low, high in zip(shares, bounds[:-1], bounds[1:], strict=True):
-            if (envs := int(min(end, high) - max(begin, low))) > 0:
-                share.append(replace(match, envs=envs))
-        begin = end
-    return shares
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One whole finished episode: its match, score (dishes), shaped event return and event counts (P, E)."""
-
-    kind: Kind
-    members: tuple[int, int]
-    score: float
-    shaped: float
-    events: np.ndarray
+from popgen.types import Segment
 
 
 class Sampler:
@@ -111,55 +75,60 @@ class Sampler:
         self.env.set_state(state["env"])
         self.env.load_generator_state(state["generator"])
         self.seating.load_state(state["seating"])
-        for name in ("whole", "score", "counts"):
-            own = getattr(self, f"_{name}")
-            setattr(self, f"_{name}", np.array(state[name], own.dtype).reshape(own.shape))
+        self._whole = np.array(state["whole"], bool).reshape(self._whole.shape)
+        self._score = np.array(state["score"], np.float64).reshape(self._score.shape)
+        self._counts = np.array(state["counts"], np.int64).reshape(self._counts.shape)
 
     def collect(self, steps: int) -> tuple[list[Segment], list[Episode]]:
         """Play `steps` joint steps: one segment per match, and the episodes that ended."""
-        env, count, spec = self.env, self.env.num_envs, self.env.spec
-        dtype = np.dtype(spec.state_dtype)
-        states = np.empty((steps, count, spec.state_size), dtype)
-        following = np.empty_like(states)
-        actions = np.empty((steps, count, 2), np.uint8)
-        events = np.empty((steps, count, 2, spec.num_events), np.uint8)
-        reward, score = np.empty((steps, count), np.float32), np.empty((steps, count), np.float32)
-        terminated, truncated = np.empty((steps, count), bool), np.empty((steps, count), bool)
-        episodes: list[Episode] = []
+        columns, episodes = self._empty_columns(steps), []
         for t in range(steps):
-            states[t] = env.get_state()
-            actions[t] = self.seating.act({view: env.encode(states[t], view) for view in self.seating.views})
-            result = env.step(actions[t])
-            following[t] = env.get_state()
-            reward[t], score[t], events[t] = result.reward, result.score, result.events
-            terminated[t], truncated[t] = result.terminated, result.truncated
+            step = take_step(self.env, self.seating)
+            result = step.result
+            columns["states"][t], columns["next_states"][t] = step.states, step.next_states
+            columns["actions"][t], columns["events"][t] = step.actions, result.events
+            columns["reward"][t], columns["score"][t] = result.reward, result.score
+            columns["terminated"][t], columns["truncated"][t] = result.terminated, result.truncated
             self._score += result.score
             self._counts += result.events
             if result.done.any():
-                episodes += self._finish(np.flatnonzero(result.done))
+                episodes += self._finish_episodes(np.flatnonzero(result.done))
             self.seating.ended(result.done)
-        return self._segments(states, following, actions, reward, score, events, terminated, truncated), episodes
+        return self._cut_segments(columns), episodes
 
-    def _finish(self, rows: np.ndarray) -> list[Episode]:
-        owners = np.repeat(np.arange(len(self.matches)), [match.envs for match in self.matches])
-        found = []
+    def _empty_columns(self, steps: int) -> dict[str, np.ndarray]:
+        """Arrays (T, B, ...) of a segment of all matches."""
+        count, spec = self.env.num_envs, self.env.spec
+        shape = (steps, count)
+        return {
+            "states": np.empty((*shape, spec.state_size), np.dtype(spec.state_dtype)),
+            "next_states": np.empty((*shape, spec.state_size), np.dtype(spec.state_dtype)),
+            "actions": np.empty((*shape, 2), np.uint8),
+            "reward": np.empty(shape, np.float32),
+            "score": np.empty(shape, np.float32),
+            "events": np.empty((*shape, 2, spec.num_events), np.uint8),
+            "terminated": np.empty(shape, bool),
+            "truncated": np.empty(shape, bool),
+        }
+
+    def _finish_episodes(self, rows: np.ndarray) -> list[Episode]:
+        """The episodes of `rows` that began at their beginning; all of the rows are reset."""
+        numbers, episodes = match_of_columns(self.matches), []
         for row in rows:
-            match = self.matches[owners[row]]
+            match = self.matches[numbers[row]]
             if self._whole[row]:
                 shaped = float((self._counts[row] * self._weights).sum())
-                counts = self._counts[row].copy()
-                found.append(Episode(match.kind, match.members, float(self._score[row]), shaped, counts))
+                counts, score = self._counts[row].copy(), float(self._score[row])
+                episodes.append(Episode(match.kind, match.members, score, shaped, counts, match.owner))
         self.env.reset(indices=rows)
         self._whole[rows], self._score[rows], self._counts[rows] = True, 0.0, 0
-        return found
+        return episodes
 
-    def _segments(self, *columns: np.ndarray) -> list[Segment]:
-        names = ("states", "next_states", "actions", "reward", "score", "events", "terminated", "truncated")
-        segments, start = [], 0
-        for match in self.matches:
-            rows = slice(start, start + match.envs)
-            part = {name: np.ascontiguousarray(column[:, rows]) for name, column in zip(names, columns, strict=True)}
+    def _cut_segments(self, columns: dict[str, np.ndarray]) -> list[Segment]:
+        """One segment per match, numbered on."""
+        segments = []
+        for match, rows in zip(self.matches, columns_of(self.matches), strict=True):
+            part = {name: np.ascontiguousarray(column[:, rows]) for name, column in columns.items()}
             segments.append(Segment(match.kind, match.members, **part, sampler=self.name, sequence=self.sequence))
             self.sequence += 1
-            start += match.envs
         return segments

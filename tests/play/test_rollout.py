@@ -5,7 +5,8 @@ import pytest
 from support.scripted import HORIZON, ONE, QUIT, STAY, TWO, Script, TallyEnv
 
 from popgen.envs import make_env
-from popgen.play.rollout import Episodes, Transition, play, play_teams
+from popgen.play.episodes import Episodes
+from popgen.play.rollout import Transition, play, play_teams
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.simple_policies import RandomPolicy
 

@@ -8,7 +8,9 @@ import pytest
 from support.small import kitchen
 
 from popgen.envs import BatchedEnv, make_env
-from popgen.play.sampler import Episode, Match, Sampler, split_matches
+from popgen.play.episodes import Episode
+from popgen.play.matches import Match, split_matches
+from popgen.play.sampler import Sampler
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind, Segment
 

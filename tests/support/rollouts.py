@@ -9,8 +9,8 @@ import torch
 
 from popgen.envs.contract import ViewSpec
 from popgen.methods.mappo.slots import Rollout
-from popgen.methods.mappo.training_job import Group
 from popgen.nets.feed_forward import Sizes, ValueNet
+from popgen.play.matches import Match
 from popgen.types import Kind
 
 VIEW = ViewSpec((1,), "float32", False, swap=(0,))
@@ -26,15 +26,15 @@ def reads_observation() -> ValueNet:
     return net
 
 
-def rollout(steps: int, *groups: Group, seed: int = 0, **given: Any) -> Rollout:
+def rollout(steps: int, *groups: Match, seed: int = 0, **given: Any) -> Rollout:
     """Random where nothing is given; the matches sit as they are, without switches or ends of episodes."""
     rng = np.random.default_rng(seed)
     count = sum(group.envs for group in groups)
     match = np.repeat([group.members for group in groups], [group.envs for group in groups], axis=0)
     values: dict[str, Any] = {
         "obs": rng.normal(size=(steps + 1, count, 2, 1)).astype(np.float32),
-        "final_at": np.zeros((0, 2), np.int64),
-        "final": np.zeros((0, 2, 1), np.float32),
+        "cut_at": np.zeros((0, 2), np.int64),
+        "cut_obs": np.zeros((0, 2, 1), np.float32),
         "actions": rng.integers(0, 3, (steps, count, 2)).astype(np.uint8),
         "log_prob": rng.normal(size=(steps, count, 2)).astype(np.float32) - 2,
         "reward": rng.normal(size=(steps, count)).astype(np.float32),
@@ -43,16 +43,16 @@ def rollout(steps: int, *groups: Group, seed: int = 0, **given: Any) -> Rollout:
         "seats": np.broadcast_to(match, (steps, count, 2)).astype(np.int32),
         "episodes": (),
     }
-    return Rollout(groups=tuple(groups), **(values | given))
+    return Rollout(matches=tuple(groups), **(values | given))
 
 
-def sp(member: int, envs: int = 4) -> Group:
-    return Group(Kind.SP, (member, member), envs, member)
+def sp(member: int, envs: int = 4) -> Match:
+    return Match(Kind.SP, (member, member), envs, member)
 
 
-def xp(first: int, second: int, envs: int = 2) -> Group:
-    return Group(Kind.XP, (first, second), envs, max(first, second))
+def xp(first: int, second: int, envs: int = 2) -> Match:
+    return Match(Kind.XP, (first, second), envs, max(first, second))
 
 
-def mp(first: int, second: int, envs: int = 2) -> Group:
-    return Group(Kind.MP, (first, second), envs, max(first, second))
+def mp(first: int, second: int, envs: int = 2) -> Match:
+    return Match(Kind.MP, (first, second), envs, max(first, second))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-import numpy as np
 import ray
 from ray.exceptions import RayActorError
 from ray.rllib.algorithms.ppo import PPO, PPOConfig
@@ -17,13 +15,11 @@ from ray.rllib.algorithms.ppo import PPO, PPOConfig
 from popgen.config.sections import ClusterConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.mappo.batched_runner import BatchedRunner, Failure
-from popgen.methods.mappo.partner_episodes import PartnerEpisodes
+from popgen.methods.mappo.play_record import Counted, PlayRecord
 from popgen.methods.mappo.pooled_learner import PooledLearner
-from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.rl_module import module_id, module_spec, spaces
 from popgen.methods.mappo.slots import Rollout
-from popgen.methods.mappo.training_job import Group, Job
-from popgen.types import Kind
+from popgen.methods.mappo.training_job import Job
 
 ATTEMPTS = 5
 """Requests to the runners that may fail one after the other before the run does."""
@@ -31,18 +27,6 @@ ATTEMPTS = 5
 
 class RunnerError(RuntimeError):
     """A runner could not do what it was asked for."""
-
-
-@dataclass(frozen=True)
-class Counted:
-    """Environment steps of one owner and kind in one call of one runner."""
-
-    runner: int
-    owner: int
-    kind: Kind
-    steps: int
-    episodes: int
-    score: float
 
 
 @dataclass(frozen=True)
@@ -130,15 +114,8 @@ class Mappo(PPO):
         """Runners, learner, and what the training step remembers."""
         super().setup(config)
         self.job: Job = self.config.job
-        self.groups = self.job.groups()
-        diversity, ppo = self.job.diversity, self.job.ppo
-        # All fresh episodes count, or those of one seating alone would be left of many.
-        window = None if self.job.fresh or diversity is None else diversity.window
-        self.partners = {m: PartnerEpisodes(self.job.partners(m), window) for m in self.job.learning}
-        self.strongest: dict[int, int] = {}
-        self.own: dict[int, deque[float]] = {m: deque(maxlen=ppo.window) for m in self.job.learning}
-        self.rng = np.random.default_rng(self.job.seed)
-        self.taken = dict.fromkeys(self.job.learning, 0)  # self-play steps
+        self.matches = self.job.matches()
+        self.played = PlayRecord(self.job)
         self.lost: set[int] = set()
         self.rounds, self.report = 0, Report()
 
@@ -152,99 +129,67 @@ class Mappo(PPO):
         began, ppo = time.perf_counter(), self.job.ppo
         self.lost.clear()
         counted: list[Counted] = []
-        weights = self._learner(lambda learner: learner.actors())
-        if self._selects():
-            self._select(weights, counted)
-        plans = {member: self._plan(member) for member in self.job.learning}
-        active = [index for index, group in enumerate(self.groups) if self._plays(group, plans)]
-        rollouts = self._request("sample", counted, weights=weights, active=active, steps=ppo.steps)
+        weights = self._ask_learner(lambda learner: learner.actors())
+        self._select_partners(weights, counted)
+        plans = {member: self.played.plan(member, self.rounds) for member in self.job.learning}
+        active = [index for index, match in enumerate(self.matches) if self.played.is_played(match, plans)]
+        rollouts = self._request_rollouts("sample", counted, weights=weights, active=active, steps=ppo.steps)
         sampled = time.perf_counter()
         self.learner_group.update(episodes=rollouts, timesteps={}, plans=plans, progress=self.progress)
         learned = time.perf_counter()
-        figures = self._learner(lambda learner: learner.figures())
+        figures = self._ask_learner(lambda learner: learner.figures())
         self.rounds += 1
         for member in self.job.learning:
-            figures[member] = figures.get(member, {}) | self.scores(member)
+            figures[member] = figures.get(member, {}) | self.played.scores(member)
         seconds = {"sampling": sampled - began, "learning": learned - sampled}
-        seconds |= self._learner(lambda learner: learner.seconds)
+        seconds |= self._ask_learner(lambda learner: learner.seconds)
         self.report = Report(counted, figures, seconds, sorted(self.lost))
 
     @property
     def progress(self) -> float:
         """Share of the budget that every member's self-play has used up."""
-        return min(self.taken.values()) / self.job.ppo.max_steps
+        return self.played.progress
 
     @property
     def finished(self) -> bool:
         """The budget is used up, or every member's targets are reached."""
-        return self.progress >= 1.0 or all(self._reached(member) for member in self.job.learning)
+        return self.played.finished
 
     def scores(self, member: int) -> dict[str, float]:
         """Mean scores of the latest episodes: `sp`, and `xp` of the partner with the highest."""
-        found = {"sp": float(np.mean(self.own[member]))} if self.own[member] else {}
-        cross = self.partners[member].mean_scores()
-        return found | ({"xp": max(cross.values())} if cross else {})
+        return self.played.scores(member)
 
-    def _reached(self, member: int) -> bool:
-        ppo, diversity, scores = self.job.ppo, self.job.diversity, self.scores(member)
-        if len(self.own[member]) < ppo.window or scores["sp"] < ppo.target_score:
-            return False
-        partners = self.job.partners(member)
-        if not partners or diversity is None:
-            return True
-        known = self.partners[member].mean_scores()
-        return len(known) == len(partners) and max(known.values()) <= diversity.target_xp
-
-    def _plan(self, member: int) -> Plan:
-        diversity, partners = self.job.diversity, self.job.partners(member)
-        if diversity is None or not partners:
-            return Plan()
-        partner = self.partners[member].choose(diversity.partner_random, self.rng)
-        ramp = min(1.0, (self.rounds + 1) / max(1, diversity.warmup))
-        return Plan(partner, diversity.lambda_xp * ramp, diversity.lambda_mp if self.job.mixed else 0.0)
-
-    def _plays(self, group: Group, plans: Mapping[int, Plan]) -> bool:
-        """LIPO samples cross-play with every partner; CoMeDi with the chosen one, for both kinds."""
-        if group.kind is Kind.SP or (group.kind is Kind.XP and not self.job.fresh):
-            return True
-        return plans[group.owner].partner == group.partner_of(group.owner)
-
-    def _selects(self) -> bool:
+    def _select_partners(self, weights: Any, counted: list[Counted]) -> None:
+        """Where it is time for them, fresh whole episodes with every partner decide who is the strongest."""
         diversity = self.job.diversity
-        return self.job.fresh and bool(self.job.frozen) and self.rounds % diversity.select_every == 0
-
-    def _select(self, weights: Any, counted: list[Counted]) -> None:
-        """Fresh whole episodes with every partner, in both seatings, decide who is the strongest."""
-        diversity = self.job.diversity
+        if diversity is None or not self.job.fresh or not self.job.frozen or self.rounds % diversity.select_every:
+            return
         for member in self.job.learning:
-            groups = [
-                Group(Kind.XP, pair, diversity.select_episodes, member)
-                for k in self.job.partners(member)
-                for pair in ((member, k), (k, member))
-            ]
-            for partner in self.job.partners(member):
-                self.partners[member].forget(partner)
-            seed = int(self.rng.integers(2**31))
-            self._request("episodes", counted, weights=weights, groups=groups, seed=seed)
+            matches = self.played.selection_matches(member, diversity)
+            seed = int(self.played.rng.integers(2**31))
+            self._request_rollouts("episodes", counted, weights=weights, matches=matches, seed=seed)
 
     # ---- runners -------------------------------------------------------------------------------------------------
 
-    def _request(self, what: str, counted: list[Counted], **request: Any) -> list[Rollout]:
+    def _request_rollouts(self, what: str, counted: list[Counted], **request: Any) -> list[Rollout]:
         """Ask every runner, and count what comes back. A lost runner's share is missing until it has been restarted."""
-        found: list[tuple[int, Any]] = []
+        answers: list[tuple[int, Any]] = []
         for _ in range(ATTEMPTS):
-            found = self._ask(what, request)
-            if found:
+            answers = self._ask_runners(what, request)
+            if answers:
                 break
             self.restore_env_runners(self.env_runner_group)
-        if not found:
+        if not answers:
             raise RayActorError(error_msg=f"no runner answered {ATTEMPTS} times")
-        rollouts = [(runner, answer) for runner, answer in found if answer is not None]
+        rollouts = [(runner, answer) for runner, answer in answers if answer is not None]
         for runner, rollout in rollouts:
-            counted += self._count(runner, rollout, listen=what == "episodes" or not self.job.fresh)
+            judge = what == "episodes" or not self.job.fresh
+            counted += self.played.add(runner, rollout, judge_partners=judge)
         return [rollout for _, rollout in rollouts]
 
-    def _ask(self, what: str, request: Mapping[str, Any], only: list[int] | None = None) -> list[tuple[int, Any]]:
+    def _ask_runners(
+        self, what: str, request: Mapping[str, Any], only: list[int] | None = None
+    ) -> list[tuple[int, Any]]:
         """Answers of the runners (`only` some of them), in their order; those that did not answer are `lost`.
 
         Raises:
@@ -255,65 +200,39 @@ class Mappo(PPO):
             if "weights" in request:  # one copy for all runners
                 request = {**request, "weights": ray.put(request["weights"])}
             answers = group._worker_manager.foreach_actor(what, kwargs=request, remote_actor_ids=only)
-            found = {answer.actor_id: answer.get() for answer in answers if answer.ok}
-            self.lost |= set(group._worker_manager.actor_ids() if only is None else only) - found.keys()
+            replies = {answer.actor_id: answer.get() for answer in answers if answer.ok}
+            self.lost |= set(group._worker_manager.actor_ids() if only is None else only) - replies.keys()
         else:
-            found = {0: getattr(group.local_env_runner, what)(**request)}
-        for runner, answer in found.items():
+            replies = {0: getattr(group.local_env_runner, what)(**request)}
+        for runner, answer in replies.items():
             if isinstance(answer, Failure):
                 raise RunnerError(f"runner {runner} failed:\n{answer.text}")
-        return sorted(found.items())
+        return sorted(replies.items())
 
     def restore_env_runners(self, env_runner_group: Any) -> list[int]:
         """Find runners that Ray has restarted; their weights come with the next request."""
         return env_runner_group.probe_unhealthy_env_runners()
 
-    def _count(self, runner: int, rollout: Rollout, *, listen: bool) -> list[Counted]:
-        """Steps and episodes by owner and kind; scores to the windows, cross-play's where `listen`."""
-        steps: dict[tuple[int, Kind], list[float]] = defaultdict(lambda: [0, 0, 0.0])
-        for group in rollout.groups:
-            played = len(rollout.reward) * group.envs
-            steps[group.owner, group.kind][0] += played
-            if group.kind is Kind.SP:
-                self.taken[group.owner] += played
-        for episode in rollout.episodes:
-            group = rollout.groups[episode.group]
-            total = steps[group.owner, group.kind]
-            total[1] += 1
-            total[2] += episode.score
-            if group.kind is Kind.SP:
-                self.own[group.owner].append(episode.score)
-            elif group.kind is Kind.XP and listen:
-                for member in set(group.members) & set(self.job.learning):
-                    self.partners[member].add(group.partner_of(member), episode.reward, episode.score)
-        return [
-            Counted(runner, owner, kind, int(count), int(episodes), score)
-            for (owner, kind), (count, episodes, score) in steps.items()
-        ]
-
-    def _learner(self, function: Any) -> Any:
+    def _ask_learner(self, function: Any) -> Any:
         return self.learner_group.foreach_learner(function).result_or_errors[0].get()
 
     # ---- what the driver asks for --------------------------------------------------------------------------------
 
     def actors(self) -> Any:
         """Member -> weights of its actor."""
-        return self._learner(lambda learner: learner.actors())
+        return self._ask_learner(lambda learner: learner.actors())
 
     def critics(self, member: int) -> Any:
         """Weights of a member's critics."""
-        return self._learner(lambda learner: learner.critics(member))
+        return self._ask_learner(lambda learner: learner.critics(member))
 
     def snapshot(self) -> dict[str, Any]:
         """Everything to go on from exactly here: learner, runners, partners, generators, counters."""
-        runners = dict(self._ask("snapshot", {}))
+        runners = dict(self._ask_runners("snapshot", {}))
         return {
-            "learner": self._learner(lambda learner: learner.snapshot()),
+            "learner": self._ask_learner(lambda learner: learner.snapshot()),
             "runners": {str(index): state for index, state in runners.items()},
-            "partners": {str(m): known.state() for m, known in self.partners.items()},
-            "own": {str(m): list(scores) for m, scores in self.own.items()},
-            "taken": {str(m): steps for m, steps in self.taken.items()},
-            "rng": self.rng.bit_generator.state,
+            "played": self.played.state(),
             "rounds": self.rounds,
         }
 
@@ -323,15 +242,11 @@ class Mappo(PPO):
         Raises:
             KeyError, ValueError: it is of another job.
         """
-        self._learner(lambda learner: learner.restore(state["learner"]))
+        self._ask_learner(lambda learner: learner.restore(state["learner"]))
         for index, saved in state["runners"].items():
             try:
-                self._ask("restore", {"state": saved}, only=[int(index)])
+                self._ask_runners("restore", {"state": saved}, only=[int(index)])
             except RunnerError as error:
                 raise ValueError(str(error).strip().rpartition("\n")[2]) from None
-        for member in self.job.learning:
-            self.partners[member].load_state(state["partners"][str(member)])
-            self.own[member].extend(state["own"][str(member)])
-            self.taken[member] = int(state["taken"][str(member)])
-        self.rng.bit_generator.state = state["rng"]
+        self.played.load_state(state["played"])
         self.rounds = int(state["rounds"])

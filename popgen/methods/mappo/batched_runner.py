@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from typing import Any
 
@@ -18,9 +18,10 @@ from ray.rllib.env.env_runner import EnvRunner
 from popgen.envs import BatchedEnv, make_env
 from popgen.methods.mappo.rl_module import module_id, module_spec, spaces
 from popgen.methods.mappo.slots import Actor, Rollout, SlotPool
-from popgen.methods.mappo.training_job import Group, Job, share, sizes_of
+from popgen.methods.mappo.training_job import Job, sizes_of
 from popgen.nets.feed_forward import FeedForwardNet
 from popgen.nets.weights import Weights, load_weights
+from popgen.play.matches import Match, share_of_each
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ def never_raises(method: Callable[..., Any]) -> Callable[..., Any]:
     """The method, which answers with a `Failure` where it would raise an exception."""
 
     @wraps(method)
-    def call(*arguments: Any, **given: Any) -> Any:
+    def call(*arguments: Any, **keywords: Any) -> Any:
         try:
-            return method(*arguments, **given)
+            return method(*arguments, **keywords)
         except Exception:
             return Failure(traceback.format_exc())
 
@@ -44,7 +45,7 @@ def never_raises(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class BatchedRunner(EnvRunner):
-    """Steps its share of every group's environments; the local runner is number 0, remote ones count from 1.
+    """Steps its share of every match's environments; the local runner is number 0, remote ones count from 1.
 
     The learners' weights come with each request, so that a runner that was restarted, or missed one, is never stale.
     """
@@ -57,12 +58,12 @@ class BatchedRunner(EnvRunner):
         self.parts = max(1, self.num_workers)
         self.part = max(0, (self.worker_index or 0) - 1)
         idle = self.num_workers > 0 and not self.worker_index  # beside remote runners the local one has nothing to do
-        groups = job.groups()
-        mine = [Group(g.kind, g.members, 0, g.owner) for g in groups] if idle else share(groups, self.parts, self.part)
-        seed = np.random.SeedSequence([job.seed, self.part, int(_restarted())])
-        self.pool = SlotPool(self._make, mine, job.ppo.view, seed=int(seed.generate_state(1)[0]))
+        matches = job.matches()
+        mine = [replace(match, envs=0) for match in matches] if idle else share_of_each(matches, self.parts, self.part)
+        seed = np.random.SeedSequence([job.seed, self.part, int(_was_restarted())])
+        self.pool = SlotPool(self._make_envs, mine, job.ppo.view, seed=int(seed.generate_state(1)[0]))
         self.module = module_spec(job, self.spec, inference_only=True).build()
-        self.frozen: dict[int, Actor] = {member: self._actor(weights) for member, weights in job.frozen.items()}
+        self.frozen: dict[int, Actor] = {member: self._frozen_actor(weights) for member, weights in job.frozen.items()}
 
     @never_raises
     def sample(
@@ -73,23 +74,23 @@ class BatchedRunner(EnvRunner):
         steps: int = 0,
         **kwargs: Any,
     ) -> Rollout:
-        """`steps` steps of this runner's environments of the groups `active`, with the learners' `weights`."""
-        return self.pool.play(active, steps, self._actors(weights or {}))
+        """`steps` steps of this runner's environments of the matches `active`, with the learners' `weights`."""
+        return self.pool.play(active, steps, self._load_actors(weights or {}))
 
     @never_raises
     def episodes(
-        self, *, weights: Mapping[int, Weights], groups: Sequence[Group], seed: int, **kwargs: Any
+        self, *, weights: Mapping[int, Weights], matches: Sequence[Match], seed: int, **kwargs: Any
     ) -> Rollout | None:
-        """An episode from the start in each of this runner's share of the environments of `groups`, all of which are
+        """An episode from the start in each of this runner's share of the environments of `matches`, all of which are
         stepped for one horizon; None where it has no share."""
-        mine = [group for group in share(list(groups), self.parts, self.part) if group.envs]
+        mine = [match for match in share_of_each(matches, self.parts, self.part) if match.envs]
         if not mine:
             return None
         drawn = int(np.random.SeedSequence([seed, self.part]).generate_state(1)[0])
-        pool = SlotPool(self._make, mine, self.job.ppo.view, seed=drawn, stagger=False, once=True)
-        return pool.play(range(len(mine)), self.spec.horizon, self._actors(weights))
+        pool = SlotPool(self._make_envs, mine, self.job.ppo.view, seed=drawn, stagger=False, once=True)
+        return pool.play(range(len(mine)), self.spec.horizon, self._load_actors(weights))
 
-    def _actors(self, weights: Mapping[int, Weights]) -> dict[int, Actor]:
+    def _load_actors(self, weights: Mapping[int, Weights]) -> dict[int, Actor]:
         actors = dict(self.frozen)
         for member in self.job.learning:
             actors[member] = self.module[module_id(member)].unwrapped().actor
@@ -97,14 +98,14 @@ class BatchedRunner(EnvRunner):
                 load_weights(actors[member], weights[member])
         return actors
 
-    def _actor(self, weights: Weights) -> FeedForwardNet:
+    def _frozen_actor(self, weights: Weights) -> FeedForwardNet:
         spec = self.spec
         view = spec.views[self.job.ppo.view]
         net = FeedForwardNet(view, spec.num_actions, spec.num_players, sizes_of(self.job.ppo))
         load_weights(net, weights)
         return net.requires_grad_(False)
 
-    def _make(self, count: int, seed: int) -> BatchedEnv:
+    def _make_envs(self, count: int, seed: int) -> BatchedEnv:
         return make_env(self.job.env.name, count, seed=seed, **self.job.env.params)
 
     # ---- what RLlib asks for -------------------------------------------------------------------------------------
@@ -130,8 +131,8 @@ class BatchedRunner(EnvRunner):
     def set_state(self, state: Mapping[str, Any]) -> None:
         """See `get_state`; other components of RLlib's have no use here."""
         if COMPONENT_RL_MODULE in state:
-            given = state[COMPONENT_RL_MODULE]
-            self.module.set_state(ray.get(given) if isinstance(given, ray.ObjectRef) else given)
+            modules = state[COMPONENT_RL_MODULE]
+            self.module.set_state(ray.get(modules) if isinstance(modules, ray.ObjectRef) else modules)
 
     def get_metrics(self) -> dict[str, Any]:
         """Nothing: rollouts carry their episodes."""
@@ -142,7 +143,7 @@ class BatchedRunner(EnvRunner):
         assert self.pool is not None
 
 
-def _restarted() -> bool:
+def _was_restarted() -> bool:
     """Whether Ray has started this actor again: it must not draw what its first life drew."""
     context = ray.get_runtime_context() if ray.is_initialized() else None
     if context is None or context.get_actor_id() is None:

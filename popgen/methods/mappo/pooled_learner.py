@@ -16,6 +16,7 @@ from ray.rllib.core.learner.training_data import TrainingData
 from torch import Tensor
 
 from popgen.losses.ppo import clipped_surrogate, negated_surrogate
+from popgen.losses.schedules import annealed
 from popgen.methods.mappo.pooling import Plan, pool
 from popgen.methods.mappo.rl_module import CRITICS, MemberModule, module_id
 from popgen.nets.weights import Weights, load_optimiser_state, load_weights, optimiser_state, weights_of
@@ -62,7 +63,7 @@ class PooledLearner(PPOTorchLearner):
     ) -> Iterator[_Minibatch]:
         """Pool the rollouts, then epochs of minibatches in which every member has its part."""
         ppo = self.config.job.ppo
-        self._anneal(progress)
+        self._anneal_rates(progress)
         self._sums, self._figures = defaultdict(lambda: defaultdict(list)), {}
         self.seconds, began = {"pooling": 0.0, "gradients": 0.0}, time.perf_counter()
         batches = {}
@@ -71,7 +72,7 @@ class PooledLearner(PPOTorchLearner):
                 training_data.episodes,
                 member,
                 plan,
-                self._member(member).critics,
+                self._module_of(member).critics,
                 self._view,
                 discount=ppo.discount,
                 lam=ppo.lam,
@@ -129,25 +130,25 @@ class PooledLearner(PPOTorchLearner):
     def _log_steps_trained_metrics(self, batch: Any) -> None:
         """Nothing: the algorithm counts environment steps, and RLlib's counters cost a tenth of an update."""
 
-    def _anneal(self, progress: float) -> None:
-        ppo, left = self.config.job.ppo, 1.0 - min(1.0, max(0.0, progress))
-        self._entropy = ppo.entropy * (ppo.entropy_end + (1.0 - ppo.entropy_end) * left)
-        rate = ppo.learning_rate * (ppo.learning_rate_end + (1.0 - ppo.learning_rate_end) * left)
+    def _anneal_rates(self, progress: float) -> None:
+        ppo = self.config.job.ppo
+        self._entropy = annealed(ppo.entropy, ppo.entropy_end, progress)
+        rate = annealed(ppo.learning_rate, ppo.learning_rate_end, progress)
         for optimiser in self._named_optimizers.values():
             self._set_optimizer_lr(optimiser, rate)
 
-    def _member(self, member: int) -> MemberModule:
+    def _module_of(self, member: int) -> MemberModule:
         return self.module[module_id(member)].unwrapped()
 
     # ---- what the algorithm asks for -----------------------------------------------------------------------------
 
     def actors(self) -> dict[int, Weights]:
         """Member -> weights of its actor."""
-        return {member: weights_of(self._member(member).actor) for member in self.config.job.learning}
+        return {member: weights_of(self._module_of(member).actor) for member in self.config.job.learning}
 
     def critics(self, member: int) -> Weights:
         """Weights of a member's critics."""
-        return weights_of(self._member(member).critics)
+        return weights_of(self._module_of(member).critics)
 
     def figures(self) -> dict[int, dict[str, float]]:
         """Member -> means over the last update."""
@@ -160,13 +161,13 @@ class PooledLearner(PPOTorchLearner):
     def snapshot(self) -> dict[str, Any]:
         """Everything to go on from exactly here."""
         optimisers = {name: optimiser_state(optimiser) for name, optimiser in self._named_optimizers.items()}
-        modules = {str(member): weights_of(self._member(member)) for member in self.config.job.learning}
+        modules = {str(member): weights_of(self._module_of(member)) for member in self.config.job.learning}
         return {"modules": modules, "optimisers": optimisers, "order": self._order.get_state().numpy().copy()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from `snapshot()` of a learner of the same job."""
         for member, weights in state["modules"].items():
-            load_weights(self._member(int(member)), weights)
+            load_weights(self._module_of(int(member)), weights)
         for name, saved in state["optimisers"].items():
             load_optimiser_state(self._named_optimizers[name], saved)
         self._order.set_state(torch.from_numpy(np.array(state["order"])))

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from popgen.envs.contract import ViewSpec
 from popgen.losses.diversity import signed_advantage
-from popgen.losses.returns import gae
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import critic_name
 from popgen.nets.feed_forward import ValueNet, joint
+from popgen.play.trajectories import Estimates, Trajectories, estimate_advantages
 from popgen.types import Kind
 
 CHUNK = 8192
@@ -39,103 +39,83 @@ class Plan:
 
     def sources(self, member: int) -> list[tuple[Kind, int, float]]:
         """(kind, partner, weight), self-play first."""
-        found = [(Kind.SP, member, 1.0)]
+        sources = [(Kind.SP, member, 1.0)]
         if self.partner is not None:
-            found += [(Kind.XP, self.partner, self.lambda_xp), (Kind.MP, self.partner, self.lambda_mp)]
-        return [source for source in found if source[2] > 0.0]
+            sources += [(Kind.XP, self.partner, self.lambda_xp), (Kind.MP, self.partner, self.lambda_mp)]
+        return [source for source in sources if source[2] > 0.0]
 
 
 @dataclass(frozen=True)
-class Trajectories:
-    """Columns that one critic judges, of all rollouts side by side.
+class MemberTrajectories:
+    """Columns that one critic judges, of all rollouts side by side, with what is the member's of them.
 
     Attributes:
-        obs: (T + 1, n, P, *view.shape); final, final_at: as in `Rollout`.
-        actions, log_prob: (T, n, P).
-        reward, terminated, truncated: (T, n).
+        steps: the trajectories.
         trained: (T, n, P) bool, the seat was played by the member's present policy and counts.
         seat: (n,) int64, which seat of cross-play the member has; 0 where it has both.
     """
 
-    obs: Tensor
-    final_at: Tensor
-    final: Tensor
-    actions: Tensor
-    log_prob: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
+    steps: Trajectories
     trained: Tensor
     seat: Tensor
 
 
-def gather(rollouts: Sequence[Rollout], kind: Kind, member: int, partner: int) -> Trajectories | None:
+def gather(rollouts: Sequence[Rollout], kind: Kind, member: int, partner: int) -> MemberTrajectories | None:
     """The member's trajectories of a kind with a partner (itself in self-play); None where there are none."""
     parts, offset = [], 0
     for rollout in rollouts:
-        for index, group in enumerate(rollout.groups):
-            if group.kind is kind and member in group.members and group.partner_of(member) == partner:
-                parts.append(_columns(rollout, index, member, offset))
-                offset += group.envs
+        for index, match in enumerate(rollout.matches):
+            if match.kind is kind and member in match.members and match.partner_of(member) == partner:
+                parts.append(_columns_of_match(rollout, index, member, offset))
+                offset += match.envs
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts], _SIDE.get(name, 1)) for name in parts[0]}
-    return Trajectories(**joined)
+    trained, seat = joined.pop("trained"), joined.pop("seat")
+    return MemberTrajectories(Trajectories(**joined), trained, seat)
 
 
-_SIDE = {"final_at": 0, "final": 0, "seat": 0}
+_SIDE = {"cut_at": 0, "cut_obs": 0, "seat": 0}
 
 
-def _columns(rollout: Rollout, index: int, member: int, offset: int) -> dict[str, Tensor]:
-    group, columns = rollout.groups[index], rollout.columns(index)
+def _columns_of_match(rollout: Rollout, index: int, member: int, offset: int) -> dict[str, Tensor]:
+    """One match's columns, which come to stand at `offset`, as tensors."""
+    match, columns = rollout.matches[index], rollout.columns(index)
     own = rollout.seats[:, columns] == member
-    if group.kind is not Kind.XP:  # mixed play counts from the switch on, when the member has both seats
+    if match.kind is not Kind.XP:  # mixed play counts from the switch on, when the member has both seats
         own = np.broadcast_to(own.all(-1, keepdims=True), own.shape)
-    inside = (rollout.final_at[:, 1] >= columns.start) & (rollout.final_at[:, 1] < columns.stop)
-    final_at = rollout.final_at[inside] - np.array([0, columns.start - offset])
-    seat = group.members.index(member) if group.kind is Kind.XP else 0
+    inside = (rollout.cut_at[:, 1] >= columns.start) & (rollout.cut_at[:, 1] < columns.stop)
+    cut_at = rollout.cut_at[inside] - np.array([0, columns.start - offset])
+    seat = match.members.index(member) if match.kind is Kind.XP else 0
     arrays = {
         "obs": rollout.obs[:, columns],
-        "final_at": final_at,
-        "final": rollout.final[inside],
+        "cut_at": cut_at,
+        "cut_obs": rollout.cut_obs[inside],
         "actions": rollout.actions[:, columns],
         "log_prob": rollout.log_prob[:, columns],
         "reward": rollout.reward[:, columns],
         "terminated": rollout.terminated[:, columns],
-        "truncated": rollout.truncated[:, columns],
+        "cut": rollout.truncated[:, columns],
         "trained": own,
-        "seat": np.full(group.envs, seat),
+        "seat": np.full(match.envs, seat),
     }
     return {name: torch.from_numpy(np.require(array, requirements=["C", "W"])) for name, array in arrays.items()}
 
 
 def advantages(
-    found: Trajectories, critic: ValueNet, view: ViewSpec, *, discount: float, lam: float
-) -> tuple[Tensor, Tensor]:
-    """GAE of the joint reward under one critic.
+    played: MemberTrajectories, critic: ValueNet, view: ViewSpec, *, discount: float, lam: float
+) -> Estimates:
+    """GAE of the joint reward under one critic, which sees the joint observation and the member's seat."""
+    extras = torch.eye(played.steps.actions.shape[-1])[played.seat]
 
-    A terminated episode has no value after its last step. One cut at the horizon has: the critic's value of the
-    observation that it ended with, which enters as discount * v in its last reward: the next row is a new episode.
+    def value(obs: Tensor, columns: Tensor) -> Tensor:
+        return _values_in_chunks(critic, joint(obs, view).contiguous(), extras[columns])
 
-    Returns:
-        Advantages and lambda-returns, (T, n) each.
-    """
-    steps, count = found.reward.shape
-    seats = torch.eye(found.actions.shape[-1])
-    extras = seats[found.seat]
-    observed = joint(found.obs, view)
-    value = _values(critic, observed.flatten(0, 1), extras.repeat(steps + 1, 1)).view(steps + 1, count)
-    reward = found.reward.clone()
-    if len(found.final_at):
-        after = _values(critic, joint(found.final, view), extras[found.final_at[:, 1]])
-        reward[found.final_at[:, 0], found.final_at[:, 1]] += discount * after
-    goes_on = discount * (~(found.terminated | found.truncated)).float()
-    advantage = gae(reward, value, goes_on, lam)
-    return advantage, advantage + value[:-1]
+    return estimate_advantages(played.steps, value, discount=discount, lam=lam)
 
 
 @torch.no_grad()
-def _values(critic: ValueNet, obs: Tensor, extras: Tensor) -> Tensor:
+def _values_in_chunks(critic: ValueNet, obs: Tensor, extras: Tensor) -> Tensor:
     """(R,), in this process's memory wherever the critic is."""
     device = critic.mean.device
     parts = zip(obs.split(CHUNK), extras.split(CHUNK), strict=True)
@@ -156,7 +136,7 @@ class CriticRows:
 
 
 @dataclass(frozen=True)
-class Batch:
+class PooledBatch:
     """One member's pooled rows of one iteration.
 
     Attributes:
@@ -179,7 +159,7 @@ class Batch:
     critics: dict[str, CriticRows]
     figures: dict[str, float]
 
-    def to(self, device: torch.device) -> Batch:
+    def to(self, device: torch.device) -> PooledBatch:
         """On a learner's device."""
         moved = {f.name: v.to(device) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **moved, critics={name: rows.to(device) for name, rows in self.critics.items()})
@@ -215,19 +195,19 @@ def pool(
     discount: float,
     lam: float,
     value_decay: float,
-) -> Batch | None:
+) -> PooledBatch | None:
     """One member's batch; None where it played no self-play (a runner was lost).
 
     Each critic takes its returns into its statistics.
     """
     own, parts, rows, figures = None, [], {}, {}
     for kind, partner, weight in plan.sources(member):
-        found, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
-        if found is None or not bool(found.trained.any()):
+        played, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
+        if played is None or not bool(played.trained.any()):
             continue
         critic = critics[name]
-        advantage, returns = advantages(found, critic, view, discount=discount, lam=lam)
-        counted = found.trained.any(-1)
+        advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
+        counted = played.trained.any(-1)
         chosen = advantage[counted]
         spread = chosen.std(correction=0).clamp(min=1e-6)
         if kind is Kind.SP:
@@ -237,42 +217,44 @@ def pool(
         scale = torch.maximum(own, spread)
         centred = torch.zeros_like(advantage)
         centred[counted] = signed_advantage(kind, chosen - chosen.mean(), weight=weight, scale=scale)
-        parts.append(_policy_rows(found, centred, kind))
+        parts.append(_policy_rows(played, centred, kind))
         critic.see(returns[counted].to(critic.mean.device), value_decay)
-        rows[name] = _critic_rows(found, critic, returns, counted, view)
-        told = str(kind).lower()
+        rows[name] = _critic_rows(played, critic, returns, counted, view)
+        label = str(kind).lower()
         figures |= {
-            f"{told}_reward": float(found.reward[counted].mean()),
-            f"{told}_advantage_std": float(chosen.std(correction=0)),
-            f"{told}_explained": _explained(chosen, returns[counted]),
+            f"{label}_reward": float(played.steps.reward[counted].mean()),
+            f"{label}_advantage_std": float(chosen.std(correction=0)),
+            f"{label}_explained": _explained_share(chosen, returns[counted]),
         }
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return Batch(**joined, critics=rows, figures=figures)
+    return PooledBatch(**joined, critics=rows, figures=figures)
 
 
-def _policy_rows(found: Trajectories, advantage: Tensor, kind: Kind) -> dict[str, Tensor]:
-    players = found.actions.shape[-1]
-    seats = torch.eye(players).expand(*found.trained.shape, players)
-    count = int(found.trained.sum())
+def _policy_rows(played: MemberTrajectories, advantage: Tensor, kind: Kind) -> dict[str, Tensor]:
+    players = played.steps.actions.shape[-1]
+    seats = torch.eye(players).expand(*played.trained.shape, players)
+    count = int(played.trained.sum())
     return {
-        "obs": found.obs[:-1][found.trained],
-        "extras": seats[found.trained],
-        "action": found.actions[found.trained].long(),
-        "log_prob": found.log_prob[found.trained],
-        "advantage": advantage.unsqueeze(-1).expand_as(found.trained)[found.trained],
+        "obs": played.steps.obs[:-1][played.trained],
+        "extras": seats[played.trained],
+        "action": played.steps.actions[played.trained].long(),
+        "log_prob": played.steps.log_prob[played.trained],
+        "advantage": advantage.unsqueeze(-1).expand_as(played.trained)[played.trained],
         "weight": torch.full((count,), 1.0 / count),
         "cross": torch.full((count,), kind is Kind.XP),
     }
 
 
-def _critic_rows(found: Trajectories, critic: ValueNet, returns: Tensor, counted: Tensor, view: ViewSpec) -> CriticRows:
-    seats = torch.eye(found.actions.shape[-1])[found.seat].expand(*counted.shape, -1)
+def _critic_rows(
+    played: MemberTrajectories, critic: ValueNet, returns: Tensor, counted: Tensor, view: ViewSpec
+) -> CriticRows:
+    seats = torch.eye(played.steps.actions.shape[-1])[played.seat].expand(*counted.shape, -1)
     target = critic.normalised(returns[counted].to(critic.mean.device))
-    return CriticRows(joint(found.obs[:-1], view)[counted], seats[counted], target)
+    return CriticRows(joint(played.steps.obs[:-1], view)[counted], seats[counted], target)
 
 
-def _explained(advantage: Tensor, returns: Tensor) -> float:
+def _explained_share(advantage: Tensor, returns: Tensor) -> float:
     """Share of the returns' variance that the critic knew before: their advantages are its errors."""
     return float(1.0 - advantage.var(correction=0) / returns.var(correction=0).clamp(min=1e-8))

@@ -3,32 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from popgen.config.sections import EnvConfig
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.nets.feed_forward import Sizes
 from popgen.nets.weights import Weights
+from popgen.play.matches import Match
 from popgen.types import Kind
-
-
-@dataclass(frozen=True)
-class Group:
-    """`envs` environments in which `members` (seat 0, seat 1) play; the steps count as `kind`, for `owner`.
-
-    In mixed play `members` begin, and `owner` takes both seats from a random step on.
-    """
-
-    kind: Kind
-    members: tuple[int, int]
-    envs: int
-    owner: int
-
-    def partner_of(self, member: int) -> int:
-        """Who plays with `member` (itself in self-play)."""
-        first, second = self.members
-        return second if first == member else first
 
 
 @dataclass(frozen=True)
@@ -41,7 +24,7 @@ class Job:
         learning: members to train.
         frozen: member -> weights of its actor.
         mixed: with mixed play (CoMeDi).
-        fresh: the strongest partner is found by episodes of its own (CoMeDi), not by the training's.
+        fresh: the strongest partner is matches by episodes of its own (CoMeDi), not by the training's.
         seed: of everything.
     """
 
@@ -60,23 +43,23 @@ class Job:
             return []
         return sorted({*self.frozen, *self.learning} - {member})
 
-    def groups(self) -> list[Group]:
+    def matches(self) -> list[Match]:
         """All environments: self-play of every member, cross-play and mixed play of every pair in both seatings.
 
         Where two members learn together, their cross-play trains both; its steps are the later member's, as if it had
         been added to a population of the earlier ones.
         """
-        found = [Group(Kind.SP, (m, m), self.ppo.envs, m) for m in self.learning]
+        matches = [Match(Kind.SP, (m, m), self.ppo.envs, m) for m in self.learning]
         if self.diversity is None:
-            return found
+            return matches
         half = self.diversity.xp_envs // 2
         pairs = sorted({(k, m) for m in self.learning for k in self.partners(m) if k < m or k in self.frozen})
         for k, m in pairs:
-            found += [Group(Kind.XP, (m, k), half, m), Group(Kind.XP, (k, m), half, m)]
+            matches += [Match(Kind.XP, (m, k), half, m), Match(Kind.XP, (k, m), half, m)]
         half = self.diversity.mp_envs // 2
         for k, m in pairs if self.mixed else []:
-            found += [Group(Kind.MP, (m, k), half, m), Group(Kind.MP, (k, m), half, m)]
-        return found
+            matches += [Match(Kind.MP, (m, k), half, m), Match(Kind.MP, (k, m), half, m)]
+        return matches
 
     def critics(self, member: int) -> list[str]:
         """Names of a member's critics, one for each kind of trajectory and partner."""
@@ -87,17 +70,6 @@ class Job:
 def critic_name(kind: Kind, partner: int) -> str:
     """The critic of trajectories of a kind with a partner; self-play has one."""
     return "SP" if kind is Kind.SP else f"{kind}_{partner}"
-
-
-def share(groups: list[Group], parts: int, part: int) -> list[Group]:
-    """The groups with the environments that part number `part` of `parts` has of each; all parts together have all.
-
-    What does not divide goes to other parts from group to group.
-    """
-    return [
-        replace(group, envs=group.envs // parts + ((part + index) % parts < group.envs % parts))
-        for index, group in enumerate(groups)
-    ]
 
 
 def sizes_of(ppo: PpoConfig) -> Sizes:

@@ -18,9 +18,11 @@ from popgen.envs import make_env
 from popgen.methods.mappo import algorithm as module
 from popgen.methods.mappo.algorithm import Mappo, MappoConfig
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
+from popgen.methods.mappo.play_record import PlayRecord
 from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
+from popgen.play.matches import Match
 from popgen.types import Kind
 
 HORIZON = 20
@@ -102,7 +104,7 @@ def test_counts_are_those_of_the_runners(comedi: Mappo, monkeypatch: pytest.Monk
         comedi.train()
         by_kind: Counter[tuple[int, str]] = Counter()
         for _, rollout in rollouts:
-            for group in rollout.groups:
+            for group in rollout.matches:
                 by_kind[group.owner, str(group.kind)] += len(rollout.reward) * group.envs
         assert totals(comedi) == dict(by_kind)
         fresh = [rollout.steps for name, rollout in rollouts if name == "episodes"]
@@ -121,19 +123,19 @@ def test_fresh_episodes_choose_the_strongest_partner(comedi: Mappo, monkeypatch:
     comedi.train()
     rewards: dict[int, list[float]] = {1: [], 2: []}
     for episode in rollouts[0][1].episodes:
-        rewards[rollouts[0][1].groups[episode.group].partner_of(3)].append(episode.reward)
+        rewards[episode.partner_of(3)].append(episode.shaped)
     assert [len(found) for found in rewards.values()] == [6, 6]
     strongest = max(rewards, key=lambda partner: float(np.mean(rewards[partner])))
     assert plans == [Plan(strongest, pytest.approx(0.25 / 4), 0.25)]
-    met = {group.partner_of(3) for group in rollouts[1][1].groups if group.kind is not Kind.SP}
+    met = {group.partner_of(3) for group in rollouts[1][1].matches if group.kind is not Kind.SP}
     assert met == {strongest}
 
 
 def test_all_fresh_episodes_decide_however_many(comedi: Mappo) -> None:
     assert CROSS.window == 32
     for _ in range(40):
-        comedi.partners[3].add(1, 1.0, 0.0)
-    assert len(comedi.partners[3].returns[1]) >= 40
+        comedi.played.partners[3].add(1, [1.0], [0.0])
+    assert len(comedi.played.partners[3].returns[1]) >= 40
 
 
 def test_a_runner_without_a_share_of_the_fresh_episodes_is_left_out(
@@ -142,16 +144,17 @@ def test_a_runner_without_a_share_of_the_fresh_episodes_is_left_out(
     rollouts = seen(comedi, monkeypatch)
     counted: list[module.Counted] = []
     weights = comedi.actors()
-    ask = comedi._ask
-    monkeypatch.setattr(comedi, "_ask", lambda what, request: [(1, None), *ask(what, request)])
-    comedi._select(weights, counted)
+    ask = comedi._ask_runners
+    monkeypatch.setattr(comedi, "_ask_runners", lambda what, request: [(1, None), *ask(what, request)])
+    comedi.rounds = 0
+    comedi._select_partners(weights, counted)
     assert [c.steps for c in counted] == [rollouts[0][1].steps] and rollouts[0][0] == "episodes"
 
 
 def test_lambda_rises_and_stays(comedi: Mappo) -> None:
     found = []
     for comedi.rounds in range(6):
-        found.append(comedi._plan(3).lambda_xp)
+        found.append(comedi.played.plan(3, comedi.rounds).lambda_xp)
     assert found == pytest.approx([0.0625, 0.125, 0.1875, 0.25, 0.25, 0.25])
 
 
@@ -164,14 +167,15 @@ def test_all_members_meet_all_others(solo: Mappo) -> None:
         assert totals(algorithm) == {(m, "SP"): 40 for m in (1, 2, 3)} | {(2, "XP"): 40, (3, "XP"): 80}
         after = algorithm.actors()
         assert all((before[m]["0.weight"] != after[m]["0.weight"]).any() for m in (1, 2, 3))
-        for member, known in algorithm.partners.items():
+        for member, known in algorithm.played.partners.items():
             assert set(known.returns) == {1, 2, 3} - {member} and all(known.returns.values())
-        assert list(algorithm.partners[1].returns[2]) == list(algorithm.partners[2].returns[1])
+        assert list(algorithm.played.partners[1].returns[2]) == list(algorithm.played.partners[2].returns[1])
         for strongest in (2, 3):  # the only one that member 1 is trained against, while all are sampled
-            algorithm.partners[1].add(strongest, 1e6 * strongest, 0.0)
-            plan = algorithm._plan(1)
+            algorithm.played.partners[1].add(strongest, [1e6 * strongest], [0.0])
+            plan = algorithm.played.plan(1, algorithm.rounds)
             assert plan == Plan(strongest, pytest.approx(0.25 * 3 / 4))
-            assert all(algorithm._plays(group, {1: plan, 2: Plan(1), 3: Plan(1)}) for group in algorithm.groups)
+            plans = {1: plan, 2: Plan(1), 3: Plan(1)}
+            assert all(algorithm.played.is_played(match, plans) for match in algorithm.matches)
     finally:
         algorithm.stop()
 
@@ -189,14 +193,12 @@ def ends(**values: Any) -> tuple[bool, ...]:
     """Whether a member with two partners is at its end, with these scores."""
     diversity = CROSS.model_copy(update={"target_xp": values.get("target_xp", 0.0)})
     ppo = PPO.model_copy(update={"target_score": values.get("target", 1e9)})
-    algorithm = Mappo.__new__(Mappo)
-    algorithm.job = Job(ENV, ppo, diversity, (3,), seed=0, frozen={1: {}, 2: {}})
-    algorithm.taken = {3: values.get("taken", 40)}
-    algorithm.own = {3: values.get("own", [])}
-    algorithm.partners = {3: module.PartnerEpisodes([1, 2], 5)}
+    played = PlayRecord(Job(ENV, ppo, diversity, (3,), seed=0, frozen={1: {}, 2: {}}))
+    played.taken[3] = values.get("taken", 40)
+    played.own[3].extend(values.get("own", []))
     for partner, score in values.get("cross", ()):
-        algorithm.partners[3].add(partner, 0.0, score)
-    return algorithm.finished
+        played.partners[3].add(partner, [0.0], [score])
+    return played.finished
 
 
 def test_training_ends_with_its_budget_or_its_targets() -> None:
@@ -220,17 +222,17 @@ def test_a_training_leaves_nothing_in_the_users_home(solo: Mappo) -> None:
 
 def test_the_budget_is_what_came_back(solo: Mappo, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lost runner's share is not counted, and therefore sampled later."""
-    before = solo.taken[1]
-    request = solo._request
+    before = solo.played.taken[1]
+    request = solo._request_rollouts
 
     def half(what: str, counted: list[module.Counted], **given: Any) -> list[Rollout]:
         pool = solo.env_runner_group.local_env_runner.pool
-        monkeypatch.setattr(pool, "groups", (module.Group(Kind.SP, (1, 1), 2, 1),))
+        monkeypatch.setattr(pool, "matches", (Match(Kind.SP, (1, 1), 2, 1),))
         return request(what, counted, **given)
 
-    monkeypatch.setattr(solo, "_request", half)
+    monkeypatch.setattr(solo, "_request_rollouts", half)
     solo.train()
-    assert solo.taken[1] == before + 20 and solo.progress == pytest.approx((before + 20) / 400)
+    assert solo.played.taken[1] == before + 20 and solo.progress == pytest.approx((before + 20) / 400)
 
 
 def test_an_algorithm_goes_on_from_its_snapshot(solo: Mappo, comedi: Mappo) -> None:
@@ -268,7 +270,7 @@ def test_a_killed_runner_is_replaced_and_every_step_counted_once() -> None:
             steps.append({c.runner: c.steps for c in algorithm.report.counted})
             assert set(algorithm.report.lost) == {1, 2} - set(steps[-1]), "the loss is told"
         assert steps[0] in ({2: 20}, {1: 20, 2: 20}) and steps[-1] == {1: 20, 2: 20}
-        assert algorithm.taken[1] == 40 + sum(sum(one.values()) for one in steps)
+        assert algorithm.played.taken[1] == 40 + sum(sum(one.values()) for one in steps)
         state = algorithm.snapshot()
         assert set(state["runners"]) == {"1", "2"}
         algorithm.resume(state)

@@ -10,7 +10,8 @@ from popgen.config.run_config import RunConfig
 from popgen.config.sections import EnvConfig
 from popgen.errors import UserError
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
-from popgen.methods.mappo.training_job import Group, Job, policy_config, share
+from popgen.methods.mappo.training_job import Job, policy_config
+from popgen.play.matches import Match, share_of_each
 from popgen.types import Kind
 
 ENV = EnvConfig()
@@ -19,7 +20,7 @@ DIVERSITY = DiversityConfig(xp_envs=6, mp_envs=4)
 
 
 def summary(job: Job) -> list[tuple[str, tuple[int, int], int, int]]:
-    return [(str(group.kind), group.members, group.envs, group.owner) for group in job.groups()]
+    return [(str(group.kind), group.members, group.envs, group.owner) for group in job.matches()]
 
 
 def test_self_play_alone() -> None:
@@ -48,8 +49,8 @@ def test_a_later_member_meets_frozen_ones_in_both_seats() -> None:
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
 def test_parts_have_every_environment_once(parts: int) -> None:
-    groups = [Group(Kind.SP, (1, 1), 10, 1), Group(Kind.XP, (1, 2), 3, 2), Group(Kind.XP, (2, 1), 1, 2)]
-    shares = np.array([[group.envs for group in share(groups, parts, part)] for part in range(parts)])
+    groups = [Match(Kind.SP, (1, 1), 10, 1), Match(Kind.XP, (1, 2), 3, 2), Match(Kind.XP, (2, 1), 1, 2)]
+    shares = np.array([[group.envs for group in share_of_each(groups, parts, part)] for part in range(parts)])
     assert shares.sum(0).tolist() == [10, 3, 1]
     assert (np.ptp(shares, axis=0) <= 1).all() and np.ptp(shares.sum(1)) <= 2
 

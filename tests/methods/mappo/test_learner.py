@@ -35,11 +35,11 @@ def learner(job: Job) -> PooledLearner:
 
 
 def actors(made: PooledLearner) -> dict[int, Any]:
-    return {member: made._member(member).actor for member in made.config.job.learning}
+    return {member: made._module_of(member).actor for member in made.config.job.learning}
 
 
 def sampled(job: Job, nets: dict[int, Any], seed: int = 0) -> Rollout:
-    groups = job.groups()
+    groups = job.matches()
     pool = SlotPool(lambda n, s: make_env(ENV.name, n, seed=s, **ENV.params), groups, "features", seed=seed)
     return pool.play(range(len(groups)), 20, nets)
 
@@ -77,27 +77,27 @@ def test_a_copy_for_acting_has_no_critics() -> None:
     acting = module_spec(job, SPEC, inference_only=True).build()["member_3"]
     assert isinstance(acting, MemberModule) and {name.split(".")[0] for name in acting.state_dict()} == {"actor"}
     made = learner(job)
-    assert set(made._member(3).critics) == {"SP", "XP_1", "XP_2", "MP_1", "MP_2"}
+    assert set(made._module_of(3).critics) == {"SP", "XP_1", "XP_2", "MP_1", "MP_2"}
     for name, value in acting.actor.state_dict().items():
-        assert torch.equal(value, made._member(3).actor.state_dict()[name])  # the same seed
+        assert torch.equal(value, made._module_of(3).actor.state_dict()[name])  # the same seed
 
 
 def test_the_chosen_partners_critics_and_nothing_else_moves() -> None:
     made = learner(job := later())
     nets = with_partners(made)
-    frozen, module = copies(nets[1]), copies(made._member(3))
+    frozen, module = copies(nets[1]), copies(made._module_of(3))
     update(made, [sampled(job, nets)], {3: Plan(2, 0.5, 0.25)})
-    assert moved(made._member(3), module) == {"actor", "critics.SP", "critics.XP_2", "critics.MP_2"}
+    assert moved(made._module_of(3), module) == {"actor", "critics.SP", "critics.XP_2", "critics.MP_2"}
     assert not moved(nets[1], frozen)
 
 
 def test_members_learn_together_each_from_its_own_seats() -> None:
     job = Job(ENV, PPO, CROSS, (1, 2), seed=3)
     made = learner(job)
-    rollout, before = sampled(job, actors(made)), {m: copies(made._member(m)) for m in (1, 2)}
+    rollout, before = sampled(job, actors(made)), {m: copies(made._module_of(m)) for m in (1, 2)}
     update(made, [rollout], {1: Plan(2, 0.5), 2: Plan()})
-    assert moved(made._member(1), before[1]) == {"actor", "critics.SP", "critics.XP_2"}
-    assert moved(made._member(2), before[2]) == {"actor", "critics.SP"}
+    assert moved(made._module_of(1), before[1]) == {"actor", "critics.SP", "critics.XP_2"}
+    assert moved(made._module_of(2), before[2]) == {"actor", "critics.SP"}
 
 
 def loss(made: PooledLearner, log_ratio: list[float], advantage: list[float], cross: list[bool]) -> torch.Tensor:
@@ -139,7 +139,7 @@ def test_the_signed_loss_stops_at_the_clip_and_the_published_one_does_not() -> N
 def test_rates_go_in_a_straight_line(progress: float, share: float) -> None:
     ppo = PPO.model_copy(update={"learning_rate_end": 0.2, "entropy_end": 0.2})
     made = learner(Job(ENV, ppo, None, (1,), seed=0))
-    made._anneal(progress)
+    made._anneal_rates(progress)
     assert made._entropy == pytest.approx(0.01 * share)
     for optimiser in made._named_optimizers.values():
         assert optimiser.param_groups[0]["lr"] == pytest.approx(1e-2 * share)
@@ -155,7 +155,7 @@ def test_a_snapshot_goes_on_exactly() -> None:
     other.restore(one.snapshot())
     for made in (one, other):
         update(made, [second], plans)
-    ours, theirs = copies(one._member(3)), copies(other._member(3))
+    ours, theirs = copies(one._module_of(3)), copies(other._module_of(3))
     assert all((ours[name] == theirs[name]).all() for name in ours)
 
 
@@ -176,12 +176,12 @@ def test_fewer_rows_than_minibatches_are_learned_from() -> None:
     ppo = PPO.model_copy(update={"minibatches": 80})
     job = Job(ENV, ppo, None, (1,), seed=3)
     made = learner(job)
-    pool = SlotPool(lambda n, s: make_env(ENV.name, n, seed=s, **ENV.params), job.groups(), "features", seed=0)
+    pool = SlotPool(lambda n, s: make_env(ENV.name, n, seed=s, **ENV.params), job.matches(), "features", seed=0)
     short = pool.play([0], 2, actors(made))
-    before = copies(made._member(1))
+    before = copies(made._module_of(1))
     update(made, [short], {1: Plan()})
     assert np.isfinite(list(made.figures()[1].values())).all()
-    assert moved(made._member(1), before) == {"actor", "critics.SP"}
+    assert moved(made._module_of(1), before) == {"actor", "critics.SP"}
 
 
 CARD = torch.device("cuda", 0)
@@ -224,7 +224,7 @@ def marked(tensor: Tensor) -> bool:
 def on_card(made: PooledLearner) -> PooledLearner:
     made._device = CARD
     for member in made.config.job.learning:
-        tensors = [*made._member(member).parameters(), *made._member(member).buffers()]
+        tensors = [*made._module_of(member).parameters(), *made._module_of(member).buffers()]
         for tensor in tensors:
             mark(tensor)
     return made

@@ -8,14 +8,14 @@ import torch
 from support.rollouts import VIEW, mp, reads_observation, rollout, sp, xp
 from torch import Tensor
 
-from popgen.methods.mappo.pooling import Batch, Plan, Trajectories, advantages, gather, pool
+from popgen.methods.mappo.pooling import MemberTrajectories, Plan, PooledBatch, advantages, gather, pool
 from popgen.nets.feed_forward import ValueNet
 from popgen.types import Kind
 
 OPTIONS = {"discount": 0.5, "lam": 0.5, "value_decay": 0.0}
 
 
-def one_column(**given: np.ndarray) -> Trajectories:
+def one_column(**given: np.ndarray) -> MemberTrajectories:
     """Three steps of one environment: values 1, 2, 4 and 8 of its four observations, rewards 10, 20, 30."""
     obs = np.array([1.0, 2.0, 4.0, 8.0], np.float32).reshape(4, 1, 1, 1).repeat(2, 2)
     reward = np.array([[10.0], [20.0], [30.0]], np.float32)
@@ -28,7 +28,7 @@ def mark(t: int) -> np.ndarray:
     return np.arange(3)[:, None] == t
 
 
-def estimated(found: Trajectories) -> tuple[list[float], list[float]]:
+def estimated(found: MemberTrajectories) -> tuple[list[float], list[float]]:
     advantage, returns = advantages(found, reads_observation(), VIEW, discount=0.5, lam=0.5)
     return advantage.flatten().tolist(), returns.flatten().tolist()
 
@@ -48,7 +48,7 @@ def test_nothing_follows_a_terminated_episode() -> None:
 
 def test_an_episode_cut_at_the_horizon_has_the_value_it_ended_with() -> None:
     """The last observation before the reset is 100; the row after it, 4, is of the next episode."""
-    cut = {"final_at": np.array([[1, 0]]), "final": np.full((1, 2, 1), 100.0, np.float32)}
+    cut = {"cut_at": np.array([[1, 0]]), "cut_obs": np.full((1, 2, 1), 100.0, np.float32)}
     advantage, _ = estimated(one_column(truncated=mark(1), **cut))
     assert advantage == [10.0 + (20.0 + 50.0 - 2.0) / 4, 20.0 + 50.0 - 2.0, 30.0]
 
@@ -69,13 +69,13 @@ def critics() -> dict[str, ValueNet]:
     return {name: reads_observation() for name in ("SP", "XP_1", "XP_2", "MP_1")}
 
 
-def batch(plan: Plan, rollouts: list | None = None) -> Batch:
+def batch(plan: Plan, rollouts: list | None = None) -> PooledBatch:
     pooled = pool(rollouts or kinds(), 3, plan, critics(), VIEW, **OPTIONS)
     assert pooled is not None
     return pooled
 
 
-def raw(kind: Kind, partner: int) -> tuple[Tensor, Trajectories]:
+def raw(kind: Kind, partner: int) -> tuple[Tensor, MemberTrajectories]:
     found = gather(kinds(), kind, 3, partner)
     assert found is not None
     advantage, _ = advantages(found, reads_observation(), VIEW, discount=0.5, lam=0.5)
@@ -137,7 +137,7 @@ def test_what_happens_before_the_switch_does_not_reach_the_estimates_after_it() 
         table = kinds()[seed - 1]
         reward = table.reward.copy()
         reward[:2, 10:] += 1000.0
-        changed.append(rollout(6, *table.groups, seed=seed, seats=table.seats, reward=reward))
+        changed.append(rollout(6, *table.matches, seed=seed, seats=table.seats, reward=reward))
     plain = batch(Plan(1, lambda_xp=0.5, lambda_mp=0.25))
     other = batch(Plan(1, lambda_xp=0.5, lambda_mp=0.25), changed)
     torch.testing.assert_close(plain.advantage, other.advantage)
@@ -168,11 +168,11 @@ def test_ends_of_episodes_follow_their_columns() -> None:
     """Groups are cut out and put side by side: the places of truncations must move with them."""
     at = np.array([[0, 1], [1, 4], [2, 7]])
     final = np.array([1.0, 2.0, 3.0], np.float32).reshape(3, 1, 1).repeat(2, 1)
-    table = rollout(3, sp(3), xp(3, 1), xp(1, 3), final_at=at, final=final)
+    table = rollout(3, sp(3), xp(3, 1), xp(1, 3), cut_at=at, cut_obs=final)
     found = gather([table, table], Kind.XP, 3, 1)
     assert found is not None
-    assert found.final_at.tolist() == [[1, 0], [2, 3], [1, 4], [2, 7]]
-    assert found.final[:, 0, 0].tolist() == [2.0, 3.0, 2.0, 3.0]
+    assert found.steps.cut_at.tolist() == [[1, 0], [2, 3], [1, 4], [2, 7]]
+    assert found.steps.cut_obs[:, 0, 0].tolist() == [2.0, 3.0, 2.0, 3.0]
 
 
 def test_an_epoch_has_every_row_once() -> None:

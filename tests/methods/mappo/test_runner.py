@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections import Counter
+
 import pytest
 
 from popgen.config.sections import ClusterConfig, EnvConfig
@@ -12,8 +13,9 @@ from popgen.methods.mappo.batched_runner import BatchedRunner
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.methods.mappo.rl_module import module_spec
 from popgen.methods.mappo.slots import Rollout
-from popgen.methods.mappo.training_job import Group, Job
+from popgen.methods.mappo.training_job import Job
 from popgen.nets.weights import Weights, weights_of
+from popgen.play.matches import Match
 from popgen.types import Kind
 
 # A small arena, which players soon leave: an episode's end.
@@ -38,8 +40,8 @@ def runner(part: int, parts: int) -> BatchedRunner:
 
 
 def fresh(part: int, parts: int, episodes: int, seed: int = 3) -> Rollout | None:
-    groups = [Group(Kind.XP, pair, episodes, 2) for pair in ((2, 1), (1, 2))]
-    found = runner(part, parts).episodes(weights={2: actor(9)}, groups=groups, seed=seed)
+    groups = [Match(Kind.XP, pair, episodes, 2) for pair in ((2, 1), (1, 2))]
+    found = runner(part, parts).episodes(weights={2: actor(9)}, matches=groups, seed=seed)
     assert found is None or isinstance(found, Rollout), found
     return found
 
@@ -48,7 +50,7 @@ def fresh(part: int, parts: int, episodes: int, seed: int = 3) -> Rollout | None
 def test_runners_share_the_fresh_episodes_and_some_may_have_none(parts: int) -> None:
     found = [fresh(part, parts, episodes=2) for part in range(1, parts + 1)]
     played = [rollout for rollout in found if rollout is not None]
-    assert sum(group.envs for rollout in played for group in rollout.groups) == 4
+    assert sum(group.envs for rollout in played for group in rollout.matches) == 4
     assert sum(rollout.steps for rollout in played) == 4 * SPEC.horizon
     assert (None in found) == (parts == 7)
 
@@ -59,7 +61,7 @@ def test_every_environment_has_one_fresh_episode_however_short() -> None:
     assert rollout is not None
     done = rollout.terminated | rollout.truncated
     assert done.sum() > 2 * done.shape[1]
-    assert np.bincount([episode.group for episode in rollout.episodes]).tolist() == [40, 40]
+    assert Counter(episode.members for episode in rollout.episodes) == {(2, 1): 40, (1, 2): 40}
     first = done.argmax(0)
     by_hand = [rollout.reward[: first[column] + 1, column].sum() for column in range(80)]
     assert sorted(e.reward for e in rollout.episodes) == pytest.approx(sorted(by_hand), rel=1e-5)
@@ -74,6 +76,6 @@ def test_runners_draw_differently_and_the_same_again() -> None:
 
 
 def test_beside_remote_runners_the_local_one_has_nothing_to_step() -> None:
-    assert sum(group.envs for group in runner(0, 2).pool.groups) == 0
-    assert sum(group.envs for part in (1, 2) for group in runner(part, 2).pool.groups) == 8 + 4 + 4
-    assert sum(group.envs for group in runner(0, 0).pool.groups) == 8 + 4 + 4
+    assert sum(group.envs for group in runner(0, 2).pool.matches) == 0
+    assert sum(group.envs for part in (1, 2) for group in runner(part, 2).pool.matches) == 8 + 4 + 4
+    assert sum(group.envs for group in runner(0, 0).pool.matches) == 8 + 4 + 4

@@ -13,16 +13,16 @@ from torch import Tensor
 from popgen.envs import BatchedEnv, make_env
 from popgen.envs.reward import training_reward
 from popgen.methods.mappo.slots import Rollout, SlotPool
-from popgen.methods.mappo.training_job import Group
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
+from popgen.play.matches import Match
 from popgen.types import Kind
 
 HORIZON = 12
 SP, XP, BACK, MP = (
-    Group(Kind.SP, (1, 1), 3, 1),
-    Group(Kind.XP, (2, 1), 2, 2),
-    Group(Kind.XP, (1, 2), 2, 2),
-    Group(Kind.MP, (1, 2), 6, 2),
+    Match(Kind.SP, (1, 1), 3, 1),
+    Match(Kind.XP, (2, 1), 2, 2),
+    Match(Kind.XP, (1, 2), 2, 2),
+    Match(Kind.MP, (1, 2), 6, 2),
 )
 
 
@@ -44,7 +44,7 @@ def actors(make: Callable[[int, int], BatchedEnv] = kitchen) -> dict[int, FeedFo
     return nets
 
 
-def pool(*groups: Group, make: Callable[[int, int], BatchedEnv] = kitchen, **options: Any) -> SlotPool:
+def pool(*groups: Match, make: Callable[[int, int], BatchedEnv] = kitchen, **options: Any) -> SlotPool:
     return SlotPool(make, groups, "features", seed=5, **options)
 
 
@@ -69,8 +69,8 @@ def test_a_rollout_is_what_the_environment_does(make: Callable[[int, int], Batch
         if result.done.any():
             env.reset(indices=np.flatnonzero(result.done))
     assert (rollout.obs[40] == env.observe()).all()
-    assert [tuple(at) for at in rollout.final_at] == [cut[:2] for cut in cuts]
-    assert all((obs == cut[2]).all() for obs, cut in zip(rollout.final, cuts, strict=True))
+    assert [tuple(at) for at in rollout.cut_at] == [cut[:2] for cut in cuts]
+    assert all((obs == cut[2]).all() for obs, cut in zip(rollout.cut_obs, cuts, strict=True))
     assert rollout.steps == 200 and rollout.truncated.any() and (make is kitchen or rollout.terminated.any())
 
 
@@ -91,7 +91,7 @@ def test_actions_are_drawn_from_the_logits() -> None:
     def biased(obs: Tensor, seats: Tensor) -> Tensor:
         return torch.log(torch.tensor([0.5, 0.3, 0.1, 0.1, 1e-9, 1e-9])).expand(len(obs), 6)
 
-    rollout = pool(Group(Kind.SP, (1, 1), 100, 1)).play([0], 100, {1: biased})
+    rollout = pool(Match(Kind.SP, (1, 1), 100, 1)).play([0], 100, {1: biased})
     shares = np.bincount(rollout.actions.ravel(), minlength=6) / rollout.actions.size
     np.testing.assert_allclose(shares, [0.5, 0.3, 0.1, 0.1, 0, 0], atol=0.015)
 
@@ -99,23 +99,23 @@ def test_actions_are_drawn_from_the_logits() -> None:
 def test_episodes_are_whole_and_their_figures_are_sums() -> None:
     rollout = pool(SP, XP, make=arena).play([0, 1], 90, actors(arena))
     done = rollout.terminated | rollout.truncated
-    for index, group in enumerate(rollout.groups):
+    for index, group in enumerate(rollout.matches):
         columns = rollout.columns(index)
-        found = sorted(e.reward for e in rollout.episodes if e.group == index)
+        found = sorted(e.shaped for e in rollout.episodes if (e.kind, e.members) == (group.kind, group.members))
         by_hand = []
         for column in range(columns.start, columns.stop):
             ends = [-1, *np.flatnonzero(done[:, column])]
             whole = ends[:-1] if column == columns.start else ends[1:-1]  # the others began in the middle of one
             by_hand += [rollout.reward[a + 1 : ends[ends.index(a) + 1] + 1, column].sum() for a in whole]
         assert found == pytest.approx(sorted(by_hand), rel=1e-5) and len(found) > group.envs
-    assert all(e.score == pytest.approx(e.reward) for e in rollout.episodes)  # both are the reward here
+    assert all(e.score == pytest.approx(e.shaped) for e in rollout.episodes)  # both are the reward here
 
 
 def test_once_tells_of_the_first_episode_of_every_environment() -> None:
     slots = pool(SP, XP, make=arena, stagger=False, once=True)
     rollout = slots.play([0, 1], 90, actors(arena))
     assert (rollout.terminated | rollout.truncated).sum() > 10
-    assert sorted(episode.group for episode in rollout.episodes) == [0, 0, 0, 1, 1]
+    assert sorted(episode.members for episode in rollout.episodes) == [(1, 1)] * 3 + [(2, 1)] * 2
 
 
 def test_mixed_play_goes_over_to_the_owner_once_in_an_episode() -> None:
@@ -131,7 +131,7 @@ def test_mixed_play_goes_over_to_the_owner_once_in_an_episode() -> None:
 
 
 def test_switch_points_are_even_over_the_horizon() -> None:
-    counts = np.bincount(pool(MP).switches(24_000), minlength=HORIZON)
+    counts = np.bincount(pool(MP).draw_switches(24_000), minlength=HORIZON)
     assert len(counts) == HORIZON and counts.min() > 1800 and counts.max() < 2200
 
 
@@ -140,7 +140,7 @@ def test_a_group_that_is_not_played_waits() -> None:
     slots.play([0, 1], 3, nets)
     waiting = slots.states[slots.rows(1)].copy(), slots.age[slots.rows(1)].copy()
     rollout = slots.play([0], 7, nets)
-    assert rollout.groups == (SP,) and rollout.steps == 21
+    assert rollout.matches == (SP,) and rollout.steps == 21
     assert (slots.states[slots.rows(1)] == waiting[0]).all() and (slots.age[slots.rows(1)] == waiting[1]).all()
     goes_on = slots.play([1], 1, nets)
     assert (goes_on.obs[0] == kitchen(2, 0).encode(waiting[0])).all()
@@ -155,12 +155,12 @@ def test_a_pool_goes_on_from_its_state(make: Callable[[int, int], BatchedEnv]) -
     other = SlotPool(make, groups, "features", seed=99)
     other.load_state(state)
     later: list[Rollout] = [slots.play([0, 1, 2], 25, nets) for slots in (one, other)]
-    for name in ("obs", "actions", "log_prob", "reward", "seats", "final"):
+    for name in ("obs", "actions", "log_prob", "reward", "seats", "cut_obs"):
         assert (getattr(later[0], name) == getattr(later[1], name)).all()
     assert later[0].episodes == later[1].episodes
 
 
 def test_ends_of_episodes_are_spread_over_the_horizon() -> None:
-    rollout = pool(Group(Kind.SP, (1, 1), HORIZON, 1)).play([0], HORIZON, actors())
+    rollout = pool(Match(Kind.SP, (1, 1), HORIZON, 1)).play([0], HORIZON, actors())
     assert (rollout.truncated.sum(1) == 1).all()
     assert len(rollout.episodes) == 1  # only the one that began at its beginning is whole

@@ -1,0 +1,145 @@
+"""What a training has played: steps, scores, partners' strength, and what follows for the next iteration."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from popgen.losses.schedules import linear
+from popgen.methods.mappo.config import DiversityConfig
+from popgen.methods.mappo.pooling import Plan
+from popgen.methods.mappo.slots import Rollout
+from popgen.methods.mappo.training_job import Job
+from popgen.play.matches import Match
+from popgen.play.partner_strength import PartnerStrength, any_then_strongest
+from popgen.types import Kind
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Environment steps of one owner and kind in one call of one runner."""
+
+    runner: int
+    owner: int
+    kind: Kind
+    steps: int
+    episodes: int
+    score: float
+
+
+@dataclass
+class _Total:
+    steps: int = 0
+    episodes: int = 0
+    score: float = 0.0
+
+
+class PlayRecord:
+    """Self-play steps and scores of every learning member, and its partners' strength."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        # All fresh episodes count, or those of one seating alone would be left of many.
+        window = None if job.fresh or job.diversity is None else job.diversity.window
+        self.partners = {m: PartnerStrength("max_latest", window) for m in job.learning}
+        self.own: dict[int, deque[float]] = {m: deque(maxlen=job.ppo.window) for m in job.learning}
+        self.taken = dict.fromkeys(job.learning, 0)  # self-play steps
+        self.rng = np.random.default_rng(job.seed)
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that every member's self-play has used up."""
+        return min(self.taken.values()) / self.job.ppo.max_steps
+
+    @property
+    def finished(self) -> bool:
+        """The budget is used up, or every member's targets are reached."""
+        return self.progress >= 1.0 or all(self.is_target_reached(member) for member in self.job.learning)
+
+    def scores(self, member: int) -> dict[str, float]:
+        """Mean scores of the latest episodes: `sp`, and `xp` of the partner with the highest."""
+        own = {"sp": float(np.mean(self.own[member]))} if self.own[member] else {}
+        cross = self.partners[member].mean_scores()
+        return own | ({"xp": max(cross.values())} if cross else {})
+
+    def is_target_reached(self, member: int) -> bool:
+        """Self-play is good enough and cross-play with every partner low enough."""
+        ppo, diversity, scores = self.job.ppo, self.job.diversity, self.scores(member)
+        if len(self.own[member]) < ppo.window or scores["sp"] < ppo.target_score:
+            return False
+        partners = self.job.partners(member)
+        if not partners or diversity is None:
+            return True
+        cross = self.partners[member].mean_scores()
+        return len(cross) == len(partners) and max(cross.values()) <= diversity.target_xp
+
+    def plan(self, member: int, rounds: int) -> Plan:
+        """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`."""
+        diversity, partners = self.job.diversity, self.job.partners(member)
+        if diversity is None or not partners:
+            return Plan()
+        strength = self.partners[member].scores()
+        partner = any_then_strongest(partners, strength, diversity.partner_random, self.rng)
+        weight = linear(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
+        return Plan(partner, weight, diversity.lambda_mp if self.job.mixed else 0.0)
+
+    def is_played(self, match: Match, plans: Mapping[int, Plan]) -> bool:
+        """LIPO samples cross-play with every partner; CoMeDi with the chosen one, for both kinds."""
+        if match.kind is Kind.SP or (match.kind is Kind.XP and not self.job.fresh):
+            return True
+        return plans[match.owner].partner == match.partner_of(match.owner)
+
+    def add(self, runner: int, rollout: Rollout, *, judge_partners: bool) -> list[Counted]:
+        """Steps and episodes by owner and kind; scores to the windows, cross-play's where `judge_partners`."""
+        totals: dict[tuple[int, Kind], _Total] = defaultdict(_Total)
+        for match in rollout.matches:
+            played = len(rollout.reward) * match.envs
+            totals[match.owner, match.kind].steps += played
+            if match.kind is Kind.SP:
+                self.taken[match.owner] += played
+        for episode in rollout.episodes:
+            total = totals[episode.owner, episode.kind]
+            total.episodes += 1
+            total.score += episode.score
+            if episode.kind is Kind.SP:
+                self.own[episode.owner].append(episode.score)
+            elif episode.kind is Kind.XP and judge_partners:
+                for member in set(episode.members) & set(self.job.learning):
+                    self.partners[member].add(episode.partner_of(member), [episode.shaped], [episode.score])
+        return [
+            Counted(runner, owner, kind, total.steps, total.episodes, total.score)
+            for (owner, kind), total in totals.items()
+        ]
+
+    def selection_matches(self, member: int, diversity: DiversityConfig) -> Sequence[Match]:
+        """Fresh episodes with every partner, in both seatings, decide who is the strongest; the old ones are
+        forgotten."""
+        for partner in self.job.partners(member):
+            self.partners[member].forget(partner)
+        return [
+            Match(Kind.XP, pair, diversity.select_episodes, member)
+            for k in self.job.partners(member)
+            for pair in ((member, k), (k, member))
+        ]
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {
+            "partners": {str(m): strength.state() for m, strength in self.partners.items()},
+            "own": {str(m): list(scores) for m, scores in self.own.items()},
+            "taken": {str(m): steps for m, steps in self.taken.items()},
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Replace the contents with `state()` of a record of the same job."""
+        for member in self.job.learning:
+            self.partners[member].load_state(state["partners"][str(member)])
+            self.own[member].clear()
+            self.own[member].extend(state["own"][str(member)])
+            self.taken[member] = int(state["taken"][str(member)])
+        self.rng.bit_generator.state = state["rng"]
