@@ -1,7 +1,7 @@
 """The contract between training loops and operations.
 
-A training loop is a generator of records: what it does next (`Phase`), what happened (`Progress`, `Round`), what came of
-it (`TrainedMember`). It writes no file, counts no step in a ledger and prints nothing. One driver for all methods
+A training loop is a generator of records: what it does next (`Phase`), what happened (`Progress`, `Round`), what came
+of it (`TrainedMember`). It writes no file, counts no step in a ledger and prints nothing. One driver for all methods
 (`popgen.pipelines.population`) iterates over it, hands each record to the recorder and the reporter, and makes a
 checkpoint at a `Round` with `at_rest`. The driver answers a `Round` with True where it wants a checkpoint and the round
 was not at rest: the loop then comes to rest soon and yields a `Round` that is.
@@ -24,7 +24,7 @@ from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
-from popgen.play.sampler import Episode
+from popgen.play.episodes import Episode
 from popgen.types import Kind, Segment
 
 State = dict[str, Any]
@@ -41,6 +41,19 @@ class Pending(Protocol[T]):
 
     def result(self) -> T:
         """Wait for it; raises what the work raised."""
+
+
+Segments = Mapping[Kind, Pending[list[Segment]]]
+"""Handles of segments by kind: whoever passes them on need not look into them."""
+
+
+@dataclass(frozen=True)
+class PolicySnapshot:
+    """A policy as it travels to a sampler: kind, configuration and a handle of its weights."""
+
+    kind: str
+    config: dict[str, Any]
+    weights: Pending[Weights]
 
 
 # ---- environment steps -----------------------------------------------------------------------------------------------
@@ -83,11 +96,11 @@ class Sampled:
 
     Attributes:
         collected: their counts.
-        segments: the segments themselves, in parts, for the checkpoint's log; empty where a checkpoint needs no log.
+        segments: the segments themselves by kind, for buffers and the checkpoint's log; empty where neither wants them.
     """
 
     collected: Collected
-    segments: tuple[Pending[list[Segment]], ...] = ()
+    segments: Segments = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -140,6 +153,15 @@ class Progress:
 
 
 @dataclass(frozen=True)
+class Work:
+    """Finished tasks of one kind, and the time and processor time that they took."""
+
+    tasks: int = 0
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
 class Round(Progress):
     """A round has ended.
 
@@ -147,11 +169,13 @@ class Round(Progress):
         number: rounds of this member that have ended.
         at_rest: nothing is at work, so that a checkpoint may be made.
         must_save: a checkpoint is made whatever the time since the last one.
+        work: what each kind of work has done since these rounds began, where several go on side by side.
     """
 
     number: int = 0
     at_rest: bool = True
     must_save: bool = False
+    work: Mapping[str, Work] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -195,7 +219,7 @@ class Checkpoint:
 
     state: State
     buffers: State | None = None
-    log: Iterator[tuple[Pending[list[Segment]], int]] = field(default_factory=lambda: iter(()))
+    log: Iterator[tuple[Segments, int]] = field(default_factory=lambda: iter(()))
 
 
 class Training(Protocol):
