@@ -10,6 +10,7 @@ import torch
 
 from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
+from popgen.nets.sampling import draw_by_multinomial
 from popgen.nets.weights import load_weights, weights_of
 from popgen.shapes import check
 
@@ -74,8 +75,7 @@ class FeedForwardPolicy:
         logits = self.logits(torch.from_numpy(np.ascontiguousarray(obs)))
         if self.greedy:
             return logits.argmax(-1).numpy().astype(np.uint8)
-        drawn = torch.multinomial(logits.flatten(0, 1).softmax(-1), 1, generator=self._generator)
-        return drawn.view(logits.shape[:2]).numpy().astype(np.uint8)
+        return draw_by_multinomial(logits, self._generator).numpy().astype(np.uint8)
 
     def config(self) -> dict[str, Any]:
         """Sizes, the view's name and the way to pick an action."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +18,22 @@ from torch import Tensor
 from popgen.envs.reward import training_reward
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.simulation_starts import StartStates
+from popgen.nets.sampling import DrawnActions, draw_by_gumbel
+from popgen.play.trajectories import Trajectories
 
 Logits = Callable[[Tensor, Tensor], Tensor]
 """Observations (R, *view) and one-hot seats (R, P) -> action logits (R, A)."""
 
 
+class Partner(NamedTuple):
+    """The other member of the cross-play columns, and how it acts."""
+
+    member: int
+    logits: Logits
+
+
 @dataclass(frozen=True)
-class Layout:
+class BatchColumns:
     """Which columns of a batch are what: self-play, self-play restarted from B_XP, cross-play."""
 
     sp: int
@@ -33,25 +42,27 @@ class Layout:
 
     @property
     def total(self) -> int:
+        """All columns."""
         return self.sp + self.restart + self.xp
 
     @property
-    def both(self) -> slice:
+    def self_play(self) -> slice:
         """All self-play columns."""
         return slice(0, self.sp + self.restart)
 
     @property
-    def start(self) -> slice:
+    def started(self) -> slice:
         """Self-play from start states and B_SP."""
         return slice(0, self.sp)
 
     @property
-    def again(self) -> slice:
+    def restarted(self) -> slice:
         """Self-play from B_XP."""
         return slice(self.sp, self.sp + self.restart)
 
     @property
-    def cross(self) -> slice:
+    def cross_play(self) -> slice:
+        """Cross-play, half of the columns with the member in each seat."""
         return slice(self.sp + self.restart, self.total)
 
     @property
@@ -61,41 +72,28 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Batch:
+class SimulatedBatch(Trajectories):
     """T steps of N simulated columns.
 
     Attributes:
-        obs: (T, N, P, *view.shape) in the view's dtype, what each seat sees.
-        actions: (T, N, P) int64; log_prob: (T, N, P) of the actions under the acting policies.
-        reward, score: (T, N) float32.
-        terminated: (T, N) bool. cut: (T, N) bool, ended otherwise.
-        cut_obs: (K, P, *view.shape) where the K cut trajectories ended, in row-major order of `cut`.
-        last_obs: (N, P, *view.shape) after the last row.
+        columns: which they are.
+        score: (T, N) float32.
         valid: (T, N) bool, the step belongs to a trajectory; False while a column rests after its task terminated.
-        trajectories: how many ended or were left at the end.
+        count: trajectories that ended or were left at the end.
     """
 
-    layout: Layout
-    obs: Tensor
-    actions: Tensor
-    log_prob: Tensor
-    reward: Tensor
+    columns: BatchColumns
     score: Tensor
-    terminated: Tensor
-    cut: Tensor
-    cut_obs: Tensor
-    last_obs: Tensor
     valid: Tensor
-    trajectories: int
-
-    @property
-    def steps(self) -> int:
-        """Simulated environment steps: T * N."""
-        return self.reward.numel()
+    count: int
 
 
 class Simulator:
-    """Runs the columns of one member's batches; self-play trajectories go on from one batch to the next."""
+    """Runs the columns of one member's batches; self-play trajectories continue from one batch to the next.
+
+    The rollout of `popgen.play` with `env.simulate` as the dynamics: columns start in any state and end where their
+    trajectory does, which a rollout of whole episodes cannot, and give the same record, `Trajectories`.
+    """
 
     def __init__(self, config: XpmSimConfig, starts: StartStates, seed: int) -> None:
         self.config, self.starts, self.env = config, starts, starts.env
@@ -105,12 +103,12 @@ class Simulator:
         self.age = np.zeros(0, np.int64)
 
     @torch.no_grad()
-    def run(self, layout: Layout, own: Logits, partner: tuple[int, Logits] | None) -> Batch:
-        """`unroll` steps of all columns; `partner` is the other member of the cross-play ones and how it acts."""
-        config, spec, rows = self.config, self.env.spec, layout.total
-        states, age, limit = self._begin(layout, None if partner is None else partner[0])
-        time, view = config.unroll, spec.views["features"]
-        obs = np.empty((time, rows, spec.num_players, *view.shape), view.dtype)
+    def run(self, columns: BatchColumns, own: Logits, partner: Partner | None) -> SimulatedBatch:
+        """`unroll` steps of all columns; `partner` is the other member of the cross-play ones."""
+        spec, rows, time = self.env.spec, columns.total, self.config.unroll
+        states, age, limit = self._begin_columns(columns, partner)
+        view = spec.views["features"]
+        obs = np.empty((time + 1, rows, spec.num_players, *view.shape), view.dtype)
         actions = np.empty((time, rows, spec.num_players), np.int64)
         log_prob = torch.empty(time, rows, spec.num_players)
         reward, score = np.empty((time, rows), np.float32), np.empty((time, rows), np.float32)
@@ -119,7 +117,8 @@ class Simulator:
         ends: list[np.ndarray] = []
         for t in range(time):
             obs[t] = self.env.encode(states)
-            actions[t], log_prob[t] = self._act(layout, torch.from_numpy(obs[t]), own, partner)
+            drawn = self._draw_actions(columns, torch.from_numpy(obs[t]), own, partner)
+            actions[t], log_prob[t] = drawn.action.numpy(), drawn.log_prob
             states, result = self.env.simulate(states, actions[t])
             reward[t], score[t], terminated[t] = training_reward(spec, result), result.score, result.terminated
             age += 1
@@ -127,76 +126,72 @@ class Simulator:
             cut[t] = (result.truncated | (age >= limit)) & ~terminated[t]
             ends.append(states[cut[t]])
             # A column whose task terminated rests for what its trajectory had left: each start weighs the same.
-            resting[layout.sp :] = (terminated[t] & (age < limit))[layout.sp :]
+            resting[columns.sp :] = (terminated[t] & (age < limit))[columns.sp :]
             if t == time - 1:
-                last = self.env.encode(states)
+                obs[time] = self.env.encode(states)
             if (over := np.flatnonzero((cut[t] | terminated[t]) & ~resting)).size:
-                states[over], age[over] = self._anew(layout, over, partner), 0
-        self.running, self.age = states[: layout.sp].copy(), age[: layout.sp].copy()
-        return Batch(
-            layout=layout,
+                states[over], age[over] = self._start_again(columns, over, partner), 0
+        self.running, self.age = states[: columns.sp].copy(), age[: columns.sp].copy()
+        return SimulatedBatch(
             obs=torch.from_numpy(obs),
+            cut_at=torch.from_numpy(np.argwhere(cut)),
+            cut_obs=torch.from_numpy(self.env.encode(np.concatenate(ends))),
             actions=torch.from_numpy(actions),
             log_prob=log_prob,
             reward=torch.from_numpy(reward),
-            score=torch.from_numpy(score),
             terminated=torch.from_numpy(terminated),
             cut=torch.from_numpy(cut),
-            cut_obs=torch.from_numpy(self.env.encode(np.concatenate(ends))),
-            last_obs=torch.from_numpy(last),
+            columns=columns,
+            score=torch.from_numpy(score),
             valid=torch.from_numpy(valid),
-            trajectories=int((terminated & valid).sum() + cut.sum() + ((age > 0) & ~resting).sum()),
+            count=int((terminated & valid).sum() + cut.sum() + ((age > 0) & ~resting).sum()),
         )
 
-    def _begin(self, layout: Layout, partner: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States, ages and horizons of all columns; self-play goes on, the others start."""
+    def _begin_columns(self, columns: BatchColumns, partner: Partner | None) -> _Beginning:
+        """States, ages and horizons of all columns; self-play continues, the others start."""
         config = self.config
-        if self.running is None or len(self.running) != layout.sp:
-            self.running, self.age = self.starts.self_play(layout.sp), np.zeros(layout.sp, np.int64)
-            self._stagger(layout.sp)
-        parts = [self.running, self.starts.restart(layout.restart)]
+        if self.running is None or len(self.running) != columns.sp:
+            self.running, self.age = self.starts.self_play(columns.sp), np.zeros(columns.sp, np.int64)
+            self._stagger_ages(columns.sp)
+        parts = [self.running, self.starts.restart(columns.restart)]
         if partner is not None:
-            parts.append(self.starts.cross_play(layout.xp, partner))
-        age = np.concatenate([self.age, np.zeros(layout.total - layout.sp, np.int64)])
+            parts.append(self.starts.cross_play(columns.xp, partner.member))
+        age = np.concatenate([self.age, np.zeros(columns.total - columns.sp, np.int64)])
         horizons = (config.horizon, config.restart_horizon, config.xp_horizon)
-        return np.concatenate(parts), age, np.repeat(horizons, (layout.sp, layout.restart, layout.xp))
+        limit = np.repeat(horizons, (columns.sp, columns.restart, columns.xp))
+        return _Beginning(np.concatenate(parts), age, limit)
 
-    def _stagger(self, count: int) -> None:
+    def _stagger_ages(self, count: int) -> None:
         """Spread the ages, so that trajectories longer than a batch do not all end in the same one."""
         if self.config.horizon > self.config.unroll:
             self.age = np.arange(count, dtype=np.int64) * self.config.horizon // count
 
-    def _anew(self, layout: Layout, over: np.ndarray, partner: tuple[int, Logits] | None) -> np.ndarray:
+    def _start_again(self, columns: BatchColumns, over: np.ndarray, partner: Partner | None) -> np.ndarray:
         """Start states for the columns `over` (ascending), each of its own kind."""
-        counts = np.bincount(np.searchsorted([layout.sp, layout.sp + layout.restart], over, side="right"), minlength=3)
+        kinds = np.searchsorted([columns.sp, columns.sp + columns.restart], over, side="right")
+        counts = np.bincount(kinds, minlength=3)
         parts = [self.starts.self_play(int(counts[0])), self.starts.restart(int(counts[1]))]
         if partner is not None:
-            parts.append(self.starts.cross_play(int(counts[2]), partner[0]))
+            parts.append(self.starts.cross_play(int(counts[2]), partner.member))
         return np.concatenate(parts)
 
-    def _act(
-        self, layout: Layout, obs: Tensor, own: Logits, partner: tuple[int, Logits] | None
-    ) -> tuple[np.ndarray, Tensor]:
+    def _draw_actions(self, columns: BatchColumns, obs: Tensor, own: Logits, partner: Partner | None) -> DrawnActions:
         """Actions (N, P) drawn from the own policy, in cross-play's other seats from the partner's; log pi (N, P)."""
         rows, players = obs.shape[:2]
         logits = own(obs.flatten(0, 1), self.seats.repeat(rows, 1)).unflatten(0, (rows, players))
         if partner is not None:
-            columns, seats = torch.arange(layout.cross.start, rows), torch.from_numpy(1 - layout.seats)
-            logits[columns, seats] = partner[1](obs[columns, seats], self.seats[seats])
-        log_probs = torch.log_softmax(logits, -1)
-        # The largest of log p + Gumbel noise is a draw from p.
-        noise = torch.empty_like(log_probs).exponential_(generator=self.generator).log_()
-        chosen = (log_probs - noise).argmax(-1, keepdim=True)
-        return chosen.squeeze(-1).numpy(), log_probs.gather(-1, chosen).squeeze(-1)
+            index, seats = torch.arange(columns.cross_play.start, rows), torch.from_numpy(1 - columns.seats)
+            logits[index, seats] = partner.logits(obs[index, seats], self.seats[seats])
+        return draw_by_gumbel(logits, self.generator)
 
     @torch.no_grad()
     def score(self, states: np.ndarray, steps: int, own: Logits) -> np.ndarray:
         """(N,) score of self-play from `states` (N, S) over at most `steps` steps, to the episode's end."""
-        layout, total = Layout(len(states), 0, 0), np.zeros(len(states))
+        columns, total = BatchColumns(len(states), 0, 0), np.zeros(len(states))
         going_on = np.ones(len(states), bool)
         for _ in range(steps):
-            actions, _ = self._act(layout, torch.from_numpy(self.env.encode(states)), own, None)
-            states, result = self.env.simulate(states, actions)
+            drawn = self._draw_actions(columns, torch.from_numpy(self.env.encode(states)), own, None)
+            states, result = self.env.simulate(states, drawn.action.numpy())
             total += np.where(going_on, result.score, 0.0)
             going_on &= ~result.done
         return total
@@ -212,3 +207,11 @@ class Simulator:
         self.running = np.array(running["states"]) if running else None
         self.age = np.array(running["age"]) if running else np.zeros(0, np.int64)
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
+
+
+class _Beginning(NamedTuple):
+    """What columns begin with: states (N, S), steps taken (N,) and most steps of a trajectory (N,)."""
+
+    states: np.ndarray
+    age: np.ndarray
+    limit: np.ndarray

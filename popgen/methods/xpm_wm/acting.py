@@ -55,9 +55,8 @@ class WorldModelPolicy:
                 torch.from_numpy(np.ascontiguousarray(is_first)),
                 self._generator,
             )
-            pair = Latent(*(x.unsqueeze(1).expand(-1, 2, -1) for x in (self._latent.h, self._latent.z)))
             seats = torch.tensor([0, 1]).expand(len(is_first), 2)
-            return self.actor.sample(pair, seats, self._generator).numpy().astype(np.uint8)
+            return self.actor.sample(self._latent.expand_players(), seats, self._generator).numpy().astype(np.uint8)
 
     def memory(self) -> dict[str, Any]:
         """The running episodes' latents and the generator; see `popgen.play.policy.Remembering`."""

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.latents import Latent, player_masks
 from popgen.nets.blocks import mlp
+from popgen.nets.sampling import draw_by_inversion
 from popgen.nets.two_hot import TwoHot
 
 
@@ -49,10 +50,7 @@ class Actor(nn.Module):
     @torch.no_grad()
     def sample(self, latent: Latent, seat: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """(...,) int64 actions."""
-        cumulative = self.log_probs(latent, seat).exp().cumsum(-1)
-        uniform = torch.rand(cumulative.shape[:-1], generator=generator, device=cumulative.device)
-        draws = (cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
-        return draws.clamp(max=cumulative.shape[-1] - 1)
+        return draw_by_inversion(self.log_probs(latent, seat), generator)
 
 
 class Critic(nn.Module):

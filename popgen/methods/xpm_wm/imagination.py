@@ -34,6 +34,16 @@ class Imagined:
     keep: Tensor
     running: Tensor
 
+    def of_columns(self, columns: slice) -> Imagined:
+        """Part of the batch."""
+        return Imagined(
+            Latent(self.latent.h[:, columns], self.latent.z[:, columns]),
+            self.actions[:, columns],
+            self.reward[:, columns],
+            self.keep[:, columns],
+            self.running[:, columns],
+        )
+
 
 @torch.no_grad()
 def imagine(

@@ -7,6 +7,7 @@ second to last, every operation runs over the G groups contiguously (about ten t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +24,12 @@ class Latent:
         """(..., D + C * G), the input of every head and critic."""
         return torch.cat([self.h, self.z], -1)
 
-    def __getitem__(self, index: object) -> Latent:
+    def expand_players(self) -> Latent:
+        """Each state once for each of the two players: (..., P, .)."""
+        h, z = self.h.unsqueeze(-2), self.z.unsqueeze(-2)
+        return Latent(h.expand(*h.shape[:-2], 2, h.shape[-1]), z.expand(*z.shape[:-2], 2, z.shape[-1]))
+
+    def __getitem__(self, index: Any) -> Latent:
         return Latent(self.h[index], self.z[index])
 
 

@@ -36,10 +36,10 @@ class Samples:
     log_prob: Tensor | None = None
 
     @staticmethod
-    def of(
+    def from_imagined(
         imagined: Imagined, key: int, seats: Tensor, returns: Tensor, advantage: Tensor, entropy_scale: float
     ) -> Samples:
-        """Of trajectories (H, B): `seats` (B, K) int64 are the member's, the first of which the critic is told."""
+        """Trajectories (H, B) in one row each: `seats` (B, K) int64 are the member's, the critic is told the first."""
         steps, batch = imagined.reward.shape
         seats = seats.expand(steps, batch, -1)
         latent, actions = imagined.latent[:-1], imagined.actions.gather(-1, seats)
@@ -50,12 +50,20 @@ class Samples:
         return len(self.returns)
 
     def __getitem__(self, rows: Tensor) -> Samples:
-        names = ("latent", "seat", "returns", "seats", "actions", "advantage", "running")
-        log_prob = None if self.log_prob is None else self.log_prob[rows]
-        return replace(self, **{name: getattr(self, name)[rows] for name in names}, log_prob=log_prob)
+        return replace(
+            self,
+            latent=self.latent[rows],
+            seat=self.seat[rows],
+            returns=self.returns[rows],
+            seats=self.seats[rows],
+            actions=self.actions[rows],
+            advantage=self.advantage[rows],
+            running=self.running[rows],
+            log_prob=None if self.log_prob is None else self.log_prob[rows],
+        )
 
-    def split(self, parts: int, generator: torch.Generator) -> list[Samples]:
-        """All rows in random order as so many minibatches; as they are if that is one."""
+    def minibatches(self, parts: int, generator: torch.Generator) -> list[Samples]:
+        """All rows in random order in so many parts; as they are if that is one."""
         if parts == 1:
             return [self]
         order = torch.randperm(len(self), generator=generator, device=self.returns.device)

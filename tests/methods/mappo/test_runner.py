@@ -64,7 +64,7 @@ def test_every_environment_has_one_fresh_episode_however_short() -> None:
     assert Counter(episode.members for episode in rollout.episodes) == {(2, 1): 40, (1, 2): 40}
     first = done.argmax(0)
     by_hand = [rollout.reward[: first[column] + 1, column].sum() for column in range(80)]
-    assert sorted(e.reward for e in rollout.episodes) == pytest.approx(sorted(by_hand), rel=1e-5)
+    assert sorted(e.shaped for e in rollout.episodes) == pytest.approx(sorted(by_hand), rel=1e-5)
 
 
 def test_runners_draw_differently_and_the_same_again() -> None:

@@ -10,9 +10,11 @@ import torch
 from support.exact import kitchen, segment
 
 from popgen.envs import BatchedEnv, make_env
-from popgen.methods.xpm_sim.agent import SELF, SHARED, XpmSimLearner, make_actor
+from popgen.methods.xpm_sim.agent import XpmSimLearner, make_actor, self_play_target
 from popgen.methods.xpm_sim.config import XpmSimConfig
+from popgen.methods.xpm_sim.critics import SELF, SHARED
 from popgen.methods.xpm_sim.restart_check import restart_check
+from popgen.methods.xpm_sim.simulation import Partner
 from popgen.nets.weights import Weights, weights_of
 
 SMALL = XpmSimConfig(
@@ -56,18 +58,19 @@ def test_cross_play_lowers_what_earns_with_the_partner_and_self_play_raises_it()
     env = kitchen()
     for group in ("sp", "xp"):
         made = learner(env, 1, surrogate="reinforce", epochs=1, minibatches=1, lam=0.0, discount=0.0, entropy=0.0)
-        batch = made.simulator.run(made._layout(1), made.actor.net, (1, made.partners[1].net))
+        batch = made.simulator.run(made.batch_columns(1), made.actor.net, Partner(1, made.partners[1].net))
         rewarded = torch.zeros_like(batch.reward)
-        layout = batch.layout
-        columns = layout.both if group == "sp" else layout.cross
+        layout = batch.columns
+        columns = layout.self_play if group == "sp" else layout.cross_play
         rewarded[:, columns] = (batch.actions[:, columns, 0] == 2).float()  # seat 0 is rewarded for east
         batch = type(batch)(**{**vars(batch), "reward": rewarded})
         for critic in made.critics.values():
             torch.nn.init.zeros_(critic[-1].weight)
             torch.nn.init.zeros_(critic[-1].bias)
-        groups, _, metrics = made._self_play(batch)
-        chosen = groups[0] if group == "sp" else made._cross_play(batch, 1, 1.0)[0]
-        actions = chosen[0]
+        target = self_play_target(made.config, batch, made.evaluator.evaluate_self_play(batch))
+        metrics = target.figures
+        chosen = target if group == "sp" else made.cross_play(batch, 1, 1.0)
+        actions = chosen.parts[0].actions
         mine = actions.seat == 0
         east = actions.advantage[mine & (actions.action == 2)]
         other = actions.advantage[mine & (actions.action != 2)]
@@ -83,11 +86,11 @@ def test_a_large_loss_in_cross_play_gains_no_more_than_the_bound() -> None:
     gains = []
     for clip in (0.0, 1.0):
         made = learner(partners=1, lambda_xp=1.0, lambda_ramp=0, xp_clip=clip, lam=0.0, discount=0.0)
-        batch = made.simulator.run(made._layout(1), made.actor.net, (1, made.partners[1].net))
+        batch = made.simulator.run(made.batch_columns(1), made.actor.net, Partner(1, made.partners[1].net))
         reward = torch.zeros_like(batch.reward)
-        reward[0, batch.layout.cross.start] = -500.0
+        reward[0, batch.columns.cross_play.start] = -500.0
         batch = type(batch)(**{**vars(batch), "reward": reward})
-        signed = made._cross_play(batch, 1, 2.0)[0][0].advantage
+        signed = made.cross_play(batch, 1, 2.0).parts[0].actions.advantage
         gains.append(float(signed.max() - signed.median()))
     assert gains[0] > 200.0 and gains[1] < 2.0
 
@@ -105,7 +108,7 @@ def test_pressure_can_end_before_training_does() -> None:
     made = learner(lambda_xp=0.5, lambda_ramp=0, lambda_until=0.4, updates=10)
     assert [made.lambda_now() for made.updates in (0, 3, 4, 9)] == [0.5, 0.5, 0.0, 0.0]
     assert made.choose_partner() is None  # at update 9: only self-play, restarted from B_XP too
-    assert made._layout(None).restart == SMALL.sims_restart
+    assert made.batch_columns(None).restart == SMALL.sims_restart
 
 
 def test_the_strongest_partner_is_chosen_and_unseen_ones_first() -> None:
@@ -155,7 +158,7 @@ def test_a_batch_does_not_grow_with_the_number_of_partners() -> None:
 
 def test_no_weight_no_restarted_trajectories() -> None:
     made = learner(restart_weight=0.0)
-    assert made._layout(1).restart == 0
+    assert made.batch_columns(1).restart == 0
     assert "simulated_reward_restart" not in made.update()
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from popgen.envs import BatchedEnv, make_env
 from popgen.envs.reward import training_reward
 from popgen.methods.xpm_sim.config import XpmSimConfig
-from popgen.methods.xpm_sim.simulation import Batch, Layout, Simulator
+from popgen.methods.xpm_sim.simulation import BatchColumns, Partner, SimulatedBatch, Simulator
 from popgen.methods.xpm_sim.simulation_starts import StartStates
 
 
@@ -31,24 +31,26 @@ def evenly(actions: int) -> Callable[[Tensor, Tensor], Tensor]:
     return lambda obs, seats: torch.zeros(len(obs), actions)
 
 
-def simulate(env: BatchedEnv, layout: Layout, partner: int | None = 1, own: int | None = None) -> tuple[Batch, object]:
+def simulate(
+    env: BatchedEnv, layout: BatchColumns, partner: int | None = 1, own: int | None = None
+) -> tuple[SimulatedBatch, object]:
     starts = filled(env)
     simulator = Simulator(CONFIG, starts, 5)
     actions = env.spec.num_actions
     mine = evenly(actions) if own is None else always(own, actions)
-    return simulator.run(layout, mine, None if partner is None else (partner, always(2, actions))), simulator
+    return simulator.run(layout, mine, None if partner is None else Partner(partner, always(2, actions))), simulator
 
 
 def test_layout_names_the_columns_and_halves_the_seats() -> None:
-    layout = Layout(3, 2, 5)
-    assert (layout.start, layout.again, layout.cross) == (slice(0, 3), slice(3, 5), slice(5, 10))
+    layout = BatchColumns(3, 2, 5)
+    assert (layout.started, layout.restarted, layout.cross_play) == (slice(0, 3), slice(3, 5), slice(5, 10))
     assert layout.seats.tolist() == [0, 0, 0, 1, 1]
 
 
 def test_every_row_is_what_the_simulator_gives() -> None:
     env = kitchen()
-    batch, _ = simulate(env, Layout(3, 2, 4))
-    assert batch.obs.shape == (10, 9, 2, *env.spec.views["features"].shape) and batch.steps == 90
+    batch, _ = simulate(env, BatchColumns(3, 2, 4))
+    assert batch.obs.shape == (11, 9, 2, *env.spec.views["features"].shape) and batch.steps == 90
     again = 0
     for t in range(9):
         # Features do not hold the time, which does not matter before the end.
@@ -63,7 +65,7 @@ def test_every_row_is_what_the_simulator_gives() -> None:
 
 def test_trajectories_end_after_their_own_horizon_and_bootstrap_from_where_they_ended() -> None:
     env = kitchen()
-    batch, _ = simulate(env, Layout(3, 2, 4))
+    batch, _ = simulate(env, BatchColumns(3, 2, 4))
     cut = batch.cut.numpy()
     assert np.flatnonzero(cut[:, 3]).tolist() == [2, 5, 8]  # restarted self-play, 3 steps
     assert np.flatnonzero(cut[:, 5]).tolist() == [3, 7]  # cross-play, 4 steps
@@ -79,7 +81,7 @@ def test_leaving_the_bounds_is_terminal_and_not_cut() -> None:
     env = make_env("rendezvous/mppmr", 2)
     config = XpmSimConfig(horizon=50, unroll=50, restart_horizon=50, xp_horizon=50, sims_sp=2)
     simulator = Simulator(config, StartStates(config, env, 1, 0), 0)
-    batch = simulator.run(Layout(2, 0, 0), always(1, 5), None)  # both go left
+    batch = simulator.run(BatchColumns(2, 0, 0), always(1, 5), None)  # both go left
     assert batch.terminated.any() and not batch.cut[batch.terminated].any()
     first = int(batch.terminated[:, 0].nonzero()[0])
     np.testing.assert_allclose(batch.obs[first + 1, 0, 0, 0], 0.3)  # starts again
@@ -90,7 +92,7 @@ def test_cross_play_and_restarts_rest_after_leaving_so_that_each_start_weighs_th
     env = make_env("rendezvous/mppmr", 2)
     config = XpmSimConfig(horizon=50, unroll=50, restart_horizon=25, xp_horizon=50)
     simulator = Simulator(config, StartStates(config, env, 2, 0), 0)
-    batch = simulator.run(Layout(1, 1, 1), always(1, 5), (1, always(1, 5)))  # all go left, from the start
+    batch = simulator.run(BatchColumns(1, 1, 1), always(1, 5), Partner(1, always(1, 5)))  # all go left, from the start
     valid = batch.valid.numpy()
     steps = int(valid[:, 2].sum())
     assert valid[:, 0].all()  # self-play starts anew at once
@@ -100,7 +102,7 @@ def test_cross_play_and_restarts_rest_after_leaving_so_that_each_start_weighs_th
 
 
 def test_the_partner_sits_in_the_other_seat_of_cross_play_only() -> None:
-    batch, _ = simulate(kitchen(), Layout(3, 2, 4), own=5)
+    batch, _ = simulate(kitchen(), BatchColumns(3, 2, 4), own=5)
     assert (batch.actions[:, :5] == 5).all()
     own, other = [0, 0, 1, 1], [1, 1, 0, 0]
     columns = torch.arange(5, 9)
@@ -111,11 +113,11 @@ def test_log_prob_is_of_the_drawn_action_and_draws_follow_the_policy() -> None:
     env = kitchen()
     simulator = Simulator(CONFIG, filled(env), 5)
     bias = torch.tensor([0.0, 1.0, 2.0, 0.0, 0.0, -1.0])
-    batch = simulator.run(Layout(3, 2, 0), lambda obs, seats: bias.expand(len(obs), -1).clone(), None)
+    batch = simulator.run(BatchColumns(3, 2, 0), lambda obs, seats: bias.expand(len(obs), -1).clone(), None)
     expected = torch.log_softmax(bias, -1)
     torch.testing.assert_close(batch.log_prob, expected[batch.actions])
     noise = Simulator(CONFIG, filled(env), 7)
-    many = noise.run(Layout(300, 0, 0), lambda obs, seats: bias.expand(len(obs), -1).clone(), None).actions
+    many = noise.run(BatchColumns(300, 0, 0), lambda obs, seats: bias.expand(len(obs), -1).clone(), None).actions
     share = torch.bincount(many.flatten(), minlength=6) / many.numel()
     assert (share - expected.exp()).abs().max() < 0.02
 
@@ -124,11 +126,11 @@ def test_self_play_goes_on_in_the_next_batch_and_a_state_restores_it() -> None:
     env = kitchen()
     starts = filled(env)
     simulator = Simulator(CONFIG, starts, 5)
-    layout, logits = Layout(3, 2, 0), evenly(6)
+    layout, logits = BatchColumns(3, 2, 0), evenly(6)
     first = simulator.run(layout, logits, None)
     saved, drawn = simulator.state(), starts.state()
     second = simulator.run(layout, logits, None)
-    np.testing.assert_array_equal(second.obs[0, :3], first.last_obs[:3])
+    np.testing.assert_array_equal(second.obs[0, :3], first.obs[-1, :3])
     fresh = filled(env)
     other = Simulator(CONFIG, fresh, 99)
     fresh.load_state(drawn)

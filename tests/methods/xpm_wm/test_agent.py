@@ -11,7 +11,8 @@ from torch import Tensor
 
 from popgen.losses.returns import lambda_return
 from popgen.methods.xpm_wm.actor_critic import Actor
-from popgen.methods.xpm_wm.agent import SELF, AgentLearner, rollout_dtype
+from popgen.methods.xpm_wm.agent import AgentLearner, rollout_dtype
+from popgen.methods.xpm_wm.agent_networks import SELF
 from popgen.methods.xpm_wm.imagination import Imagined
 from popgen.methods.xpm_wm.latents import Latent
 from popgen.methods.xpm_wm.start_states import NEW_SP, NEW_XP, OLD, Starts
@@ -110,7 +111,7 @@ def test_good_self_play_actions_gain_and_good_cross_play_actions_lose(
     def imagined(partner: int | None) -> tuple[Imagined, Tensor]:
         return split([trajectories(ROWS, reward, seed=next(seeds)) for reward in (sp_reward, xp_reward)]), SEATS
 
-    monkeypatch.setattr(learner, "_imagine", imagined)
+    monkeypatch.setattr(learner, "imagine_play", imagined)
     before = mean_probs(learner, seat=0)
     for _ in range(10):
         learner.update()
@@ -121,11 +122,11 @@ def test_good_self_play_actions_gain_and_good_cross_play_actions_lose(
 
 def test_cross_play_moves_the_actor_by_the_lambda_times_the_reinforce_gradient() -> None:
     learner = make_learner(lambda_xp=0.25, entropy=0.0, unimix=0.0, **REINFORCE)
-    scale = float(learner.scale.update(torch.linspace(0.0, 10.0, 101)))
+    scale = float(learner.networks.scale.update(torch.linspace(0.0, 10.0, 101)))
     assert scale == pytest.approx(9.0)
     imagined = trajectories(ROWS, lambda a: good_and_bad(own_action(a)) + 5.0, seed=3)
     learner.actor.zero_grad()
-    learner._losses(learner._cross_play(imagined, 1, SEATS, learner.scale.value())[0])[0].backward()
+    learner.losses(learner.cross_play(imagined, 1, SEATS, learner.networks.scale.value()).samples).policy.backward()
     got = [parameter.grad.clone() for parameter in learner.actor.parameters()]
     learner.actor.zero_grad()
     # J_XP's gradient: mean of (return - mean return) grad ln pi, in units of the self-play returns' spread;
@@ -144,7 +145,7 @@ def test_lambda_rises_from_its_start_to_its_end() -> None:
         learner = make_learner(lambda_xp=0.5, lambda_start=0.1, lambda_ramp=10, entropy=0.0)
         learner.updates = updates
         imagined = trajectories(ROWS, lambda a: good_and_bad(own_action(a)))
-        scores.append(float(learner._cross_play(imagined, 1, SEATS, torch.ones(()))[0].advantage.std()))
+        scores.append(float(learner.cross_play(imagined, 1, SEATS, torch.ones(())).samples.advantage.std()))
     assert [round(score / scores[-1], 4) for score in scores] == [0.2, 0.6, 1.0, 1.0]
 
 
@@ -193,13 +194,15 @@ def test_each_critic_learns_from_its_own_trajectories_and_the_actor_from_no_valu
         torch.nn.init.normal_(critic.net[-1].weight)
     imagined = trajectories(ROWS, lambda a: a[..., 0])
     one = torch.ones(())
-    samples = learner._self_play(imagined) if key == SELF else learner._cross_play(imagined, key, SEATS, one)
-    actor_loss, critic_loss, _ = learner._losses(samples[0])
+    target = learner.self_play(imagined) if key == SELF else learner.cross_play(imagined, key, SEATS, one)
+    actor_loss, critic_loss, _ = learner.losses(target.samples)
     critic_loss.backward()
     for name, critic in learner.critics.items():
         for parameter in critic.parameters():
             assert (parameter.grad is not None and parameter.grad.any()) == (name == str(key))
-    assert all(parameter.grad is None for parameter in (*learner.actor.parameters(), *learner.slow.parameters()))
+    assert all(
+        parameter.grad is None for parameter in (*learner.actor.parameters(), *learner.networks.slow.parameters())
+    )
     learner.critics.zero_grad(set_to_none=True)
     actor_loss.backward()
     assert all(parameter.grad is None for parameter in learner.critics.parameters())
@@ -228,11 +231,11 @@ def test_an_update_moves_the_actor_and_the_two_critics_at_work_and_nothing_else(
 
 def test_slow_critics_follow_and_the_rollout_actor_is_the_actor() -> None:
     learner = make_learner(slow_critic=0.9)
-    old = copies(learner.slow)
+    old = copies(learner.networks.slow)
     learner.update()
-    for before, slow, fast in zip(old, learner.slow.parameters(), learner.critics.parameters(), strict=True):
+    for before, slow, fast in zip(old, learner.networks.slow.parameters(), learner.critics.parameters(), strict=True):
         torch.testing.assert_close(slow, 0.9 * before + 0.1 * fast.detach())
-    assert unchanged(learner.rollout_actor, copies(learner.actor))
+    assert unchanged(learner.networks.rollout_actor, copies(learner.actor))
 
 
 class Plays:
@@ -248,15 +251,15 @@ class Plays:
 
 def test_in_imagined_cross_play_the_partner_sits_in_the_other_seat() -> None:
     learner = make_learner(partners=(1, 2), starts_sp=5, starts_xp=4, horizon=2)
-    learner.rollout_actor = Plays(0)  # type: ignore[assignment]
+    learner.networks.rollout_actor = Plays(0)  # type: ignore[assignment]
     learner.partners[2] = Plays(3)  # type: ignore[assignment]
-    imagined, seats = learner._imagine(2)
+    imagined, seats = learner.imagine_play(2)
     assert seats.tolist() == [0, 0, 1, 1]
     for t in range(2):
         assert imagined.actions[t, :5].tolist() == [[0, 1]] * 5
         # Seated first, the agent plays 0 and its partner, second, 3 + 1; seated second, 3 + 0 and 1.
         assert imagined.actions[t, 5:].tolist() == [[0, 4], [0, 4], [3, 1], [3, 1]]
-    alone, seats = learner._imagine(None)
+    alone, seats = learner.imagine_play(None)
     assert alone.actions.shape == (2, 5, 2) and seats.tolist() == []
 
 
@@ -265,7 +268,7 @@ def test_cross_play_terms_look_at_the_agents_own_seat() -> None:
     imagined = trajectories(ROWS, lambda a: good_and_bad(a[..., 0]), seed=1)
 
     def loss(imagined: Imagined) -> Tensor:
-        return learner._losses(learner._cross_play(imagined, 1, SEATS, torch.ones(()))[0])[0]
+        return learner.losses(learner.cross_play(imagined, 1, SEATS, torch.ones(())).samples).policy
 
     before = loss(imagined)
     others = imagined.actions.clone()
@@ -279,14 +282,14 @@ def test_cross_play_terms_look_at_the_agents_own_seat() -> None:
 
 def test_targets_are_lambda_returns_of_the_slow_critic() -> None:
     learner = make_learner(discount=0.9, lam=0.8)
-    for critic in learner.slow.values():
+    for critic in learner.networks.slow.values():
         torch.nn.init.normal_(critic.net[-1].weight)
     generator = torch.Generator().manual_seed(0)
     keep = torch.rand(3, 7, generator=generator)
     imagined = Imagined(random_latent(4, 7), torch.zeros(3, 7, 2, dtype=torch.long), torch.rand(3, 7), keep, keep)
     seat = torch.ones(4, 7, dtype=torch.long)
-    returns, value = learner._targets(imagined, 2, seat)
-    torch.testing.assert_close(value, learner.slow["2"].value(imagined.latent, seat))
+    returns, value = learner.networks.targets(imagined, 2, seat)
+    torch.testing.assert_close(value, learner.networks.slow["2"].value(imagined.latent, seat))
     torch.testing.assert_close(returns, lambda_return(imagined.reward, value, 0.9 * keep, 0.8))
     assert value.abs().max() > 0.1 and not returns.requires_grad
 
@@ -320,9 +323,9 @@ def test_cross_play_starts_from_states_with_that_partner(
     learner = make_learner(starts_sp=300, starts_xp=300, xp_starts=reading)
     learner.new_share = 1.0
     drawn: list[np.ndarray] = []
-    start_rows = learner._start_rows
-    monkeypatch.setattr(learner, "_start_rows", lambda rows: (drawn.append(rows), start_rows(rows))[1])
-    learner._imagine(2)
+    start_rows = learner.start_states
+    monkeypatch.setattr(learner, "start_states", lambda rows: (drawn.append(rows), start_rows(rows))[1])
+    learner.imagine_play(2)
     (rows,) = drawn
     assert learner.starts is not None
     pools, partners = learner.starts.pool[rows], learner.starts.partner[rows]
@@ -330,9 +333,9 @@ def test_cross_play_starts_from_states_with_that_partner(
     assert {NEW_SP, NEW_XP} <= set(pools[:300])
 
 
-def test_start_rows_are_the_stored_states() -> None:
+def teststart_states_are_the_stored_states() -> None:
     learner = make_learner()
-    latent = learner._start_rows(np.array([4, 7]))
+    latent = learner.start_states(np.array([4, 7]))
     assert learner.starts is not None
     assert np.array_equal(latent.h.numpy(), learner.starts.h[[4, 7]])
     z = latent.z.unflatten(-1, (MODEL.classes, MODEL.groups))
@@ -361,8 +364,8 @@ def test_restart_forgets_the_agent_and_keeps_model_and_partners() -> None:
     learner.restart(0)
     assert unchanged(learner.model, model) and unchanged(learner.partners[1], partner)
     assert sorted(learner.critics) == ["0", "1", "2"] and learner.updates == 0
-    assert unchanged(learner.actor, copies(twin.actor)) and float(learner.scale.weight) == 0.0
-    assert unchanged(learner.rollout_actor, copies(twin.actor))
+    assert unchanged(learner.actor, copies(twin.actor)) and float(learner.networks.scale.weight) == 0.0
+    assert unchanged(learner.networks.rollout_actor, copies(twin.actor))
 
 
 def test_half_precision_imagines_and_trains_in_full() -> None:
@@ -371,7 +374,7 @@ def test_half_precision_imagines_and_trains_in_full() -> None:
     figures = [learner.update() for _ in range(3)]
     assert all(np.isfinite(list(each.values())).all() for each in figures)
     assert {p.dtype for p in learner.actor.parameters()} == {torch.float32}
-    assert {p.dtype for p in learner.rollout_actor.parameters()} == {torch.bfloat16}
+    assert {p.dtype for p in learner.networks.rollout_actor.parameters()} == {torch.bfloat16}
     learner.load_state(learner.state())
     assert np.isfinite(list(learner.update().values())).all()
 
@@ -394,9 +397,9 @@ def test_the_first_step_of_ppo_is_that_of_reinforce(key: int) -> None:
     for surrogate in ("ppo", "reinforce"):
         learner = make_learner(surrogate=surrogate, epochs=1, minibatches=1, entropy=0.01)
         given = trajectories(ROWS, lambda a: (a[..., 0] == 2).float(), seed=3)
-        samples = learner._self_play(given) if key == 0 else learner._cross_play(given, 1, SEATS, torch.ones(()))
-        assert (samples[0].log_prob is None) == (surrogate == "reinforce")
-        learner._losses(samples[0])[0].backward()
+        target = learner.self_play(given) if key == 0 else learner.cross_play(given, 1, SEATS, torch.ones(()))
+        assert (target.samples.log_prob is None) == (surrogate == "reinforce")
+        learner.losses(target.samples).policy.backward()
         gradients.append(torch.cat([parameter.grad.flatten() for parameter in learner.actor.parameters()]))
     torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-4)
     assert gradients[0].abs().max() > 1e-3
@@ -405,7 +408,8 @@ def test_the_first_step_of_ppo_is_that_of_reinforce(key: int) -> None:
 def test_self_plays_advantages_are_centred_and_in_units_of_their_spread() -> None:
     learner = make_learner(surrogate="ppo", advantage_unit="spread")
     given = trajectories(ROWS, lambda a: 7.0 * (a[..., 0] == 2).float() + 3.0)
-    samples, unit, figures = learner._self_play(given)
+    target = learner.self_play(given)
+    samples, unit, figures = target.samples, target.unit, target.figures
     assert float(samples.advantage.mean()) == pytest.approx(0.0, abs=1e-5)
     assert float(samples.advantage.std()) == pytest.approx(1.0, rel=1e-4)
     assert float(unit) == pytest.approx(figures["advantage_sp"]) == pytest.approx(float(given.reward.std()))
@@ -413,5 +417,6 @@ def test_self_plays_advantages_are_centred_and_in_units_of_their_spread() -> Non
 
 def test_where_nothing_is_at_stake_noise_is_not_blown_up() -> None:
     learner = make_learner(surrogate="ppo", advantage_unit="spread")
-    samples, unit, _ = learner._self_play(trajectories(ROWS, lambda a: 1e-4 * a[..., 0]))
+    target = learner.self_play(trajectories(ROWS, lambda a: 1e-4 * a[..., 0]))
+    samples, unit = target.samples, target.unit
     assert float(unit) == pytest.approx(0.1) and samples.advantage.abs().max() < 0.01

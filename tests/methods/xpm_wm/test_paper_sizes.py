@@ -76,7 +76,10 @@ def test_latents_are_28_joint_groups_and_4_private_ones_of_32_classes(model: Wor
 def test_agent(config: RunConfig, model: WorldModel) -> None:
     agent = AgentLearner(config.agent, config.world_model, model.spec, member=1, seed=0)
     assert hidden(agent.actor.net) == hidden(agent.critics["0"].net) == [512] * 5
-    rates = [group["lr"] for group in (*agent.actor_optimiser.param_groups, *agent.critic_optimiser.param_groups)]
+    rates = [
+        group["lr"]
+        for group in (*agent.networks.actor_optimiser.param_groups, *agent.networks.critic_optimiser.param_groups)
+    ]
     assert rates == [4e-5, 1e-4]
     assert (agent.config.horizon, agent.config.entropy, agent.config.lambda_xp) == (15, 0.03, 0.25)
 

@@ -22,7 +22,7 @@ def numbered() -> Samples:
     """Of cross-play: first and last in seat 0, the middle one in seat 1."""
     seats = torch.tensor([[0], [1], [0]])
     values = torch.arange(6.0).view(STEPS, BATCH)
-    return Samples.of(imagined(), 4, seats, values, -values, 0.1)
+    return Samples.from_imagined(imagined(), 4, seats, values, -values, 0.1)
 
 
 def test_rows_run_over_time_and_batch_and_take_the_members_own_seat() -> None:
@@ -37,16 +37,16 @@ def test_rows_run_over_time_and_batch_and_take_the_members_own_seat() -> None:
 
 def test_in_self_play_both_seats_act_and_the_critic_is_told_the_first() -> None:
     players = torch.tensor([0, 1]).expand(BATCH, 2)
-    samples = Samples.of(imagined(), 0, players, torch.zeros(STEPS, BATCH), torch.zeros(STEPS, BATCH), 0.1)
+    samples = Samples.from_imagined(imagined(), 0, players, torch.zeros(STEPS, BATCH), torch.zeros(STEPS, BATCH), 0.1)
     assert samples.actions.tolist()[4] == [11, 111] and samples.seat.tolist() == [0] * 6
 
 
 def test_minibatches_share_out_every_row_once_and_keep_rows_together() -> None:
     samples = replace(numbered(), log_prob=torch.arange(6.0).unsqueeze(-1))
-    parts = samples.split(4, torch.Generator().manual_seed(0))
+    parts = samples.minibatches(4, torch.Generator().manual_seed(0))
     assert sorted(len(part) for part in parts) == [1, 1, 2, 2]
     assert sorted(torch.cat([part.returns for part in parts]).tolist()) == [0, 1, 2, 3, 4, 5]
     for part in parts:
         assert part.log_prob is not None and torch.equal(part.log_prob[:, 0], part.returns)
         assert torch.equal(part.latent.z, samples.latent.z[part.returns.long()])
-    assert samples.split(1, torch.Generator()) == [samples]
+    assert samples.minibatches(1, torch.Generator()) == [samples]
