@@ -18,6 +18,9 @@ def reinforce(log_prob: Tensor, advantage: Tensor, entropy: Tensor, weight: Tens
 class ReturnScale(nn.Module):
     """Moving range between two percentiles of the returns, at least 1 (DreamerV3's normaliser)."""
 
+    range: Tensor
+    weight: Tensor
+
     def __init__(self, percentiles: tuple[float, float], decay: float = 0.99) -> None:
         super().__init__()
         self.percentiles, self.decay = percentiles, decay

@@ -23,7 +23,7 @@ def lambda_return(reward: Tensor, value: Tensor, discount: Tensor, lam: float) -
     if value.shape[0] != reward.shape[0] + 1 or reward.shape != discount.shape:
         raise ValueError(f"shapes: reward {tuple(reward.shape)}, value {tuple(value.shape)}, {tuple(discount.shape)}")
     following = value[-1]
-    returns = []
+    returns: list[Tensor] = []
     for t in reversed(range(reward.shape[0])):
         following = reward[t] + discount[t] * ((1.0 - lam) * value[t + 1] + lam * following)
         returns.append(following)

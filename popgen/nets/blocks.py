@@ -74,7 +74,7 @@ def _conv(
     layer = kind(inputs, outputs, kernel, padding=kernel // 2, bias=bias)
     deviation = math.sqrt(2.0 / ((inputs + outputs) * kernel**2))
     nn.init.trunc_normal_(layer.weight, std=deviation, a=-2 * deviation, b=2 * deviation)
-    if bias:
+    if layer.bias is not None:
         nn.init.zeros_(layer.bias)
     return layer
 

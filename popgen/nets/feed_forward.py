@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from popgen.envs.contract import ViewSpec
@@ -30,7 +31,7 @@ class Sizes:
         """JSON-able; what stands at its default is left out."""
         plain = Sizes()
         kept = {k: v for k, v in asdict(self).items() if k in ("units", "layers") or v != getattr(plain, k)}
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in kept.items()}
+        return kept | {"kernels": list(self.kernels)} if "kernels" in kept else kept
 
 
 class FeedForwardNet(nn.Sequential):
@@ -46,6 +47,8 @@ class FeedForwardNet(nn.Sequential):
     Raises:
         ValueError: a grid without kernels or a flat view with some, or an even kernel.
     """
+
+    largest: Tensor
 
     def __init__(self, view: ViewSpec, outputs: int, extras: int, sizes: Sizes, copies: int = 1) -> None:
         grid = len(view.shape) == 3
@@ -72,7 +75,7 @@ class FeedForwardNet(nn.Sequential):
         self.register_buffer("largest", largest, persistent=False)
         self.scaled = bool((largest != 1.0).any())
 
-    def forward(self, obs: Tensor, extras: Tensor) -> Tensor:
+    def forward(self, obs: Tensor, extras: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         """obs (R, *shape) of any dtype, extras (R, X) -> (R, outputs)."""
         check(obs, (None, *self.shape), "obs")
         values = obs.float()
@@ -96,6 +99,7 @@ def orthogonal(net: FeedForwardNet, output_gain: float, generator: torch.Generat
     for layer in layers:
         gain = output_gain if layer is layers[-1] else math.sqrt(2.0)
         nn.init.orthogonal_(layer.weight, gain, generator=generator)
+        assert layer.bias is not None
         nn.init.zeros_(layer.bias)
 
 
@@ -111,12 +115,23 @@ def joint(obs: Tensor, view: ViewSpec) -> Tensor:
     return first if joint_copies(view) == 1 else torch.cat([first, obs.select(dim, 1)], -1)
 
 
+class ReturnStatistics(NamedTuple):
+    """Mean and standard deviation of returns, scalars."""
+
+    mean: Tensor
+    deviation: Tensor
+
+
 class ValueNet(FeedForwardNet):
     """A critic of the joint observation that learns normalised returns: v = mean + deviation * output.
 
     When the statistics of the returns move, the last layer is changed so that v does not (van Hasselt et al. 2016,
     "Learning values across many orders of magnitude", PopArt).
     """
+
+    mean: Tensor
+    square: Tensor
+    weight: Tensor
 
     def __init__(self, view: ViewSpec, extras: int, sizes: Sizes, generator: torch.Generator) -> None:
         super().__init__(view, 1, extras, sizes, joint_copies(view))
@@ -125,16 +140,16 @@ class ValueNet(FeedForwardNet):
         self.register_buffer("square", torch.zeros(()))
         self.register_buffer("weight", torch.zeros(()))
 
-    def statistics(self) -> tuple[Tensor, Tensor]:
+    def statistics(self) -> ReturnStatistics:
         """Mean and standard deviation of the returns seen so far, 0 and 1 before any."""
         if not bool(self.weight > 0):
-            return torch.zeros(()), torch.ones(())
+            return ReturnStatistics(torch.zeros(()), torch.ones(()))
         mean = self.mean / self.weight
         variance = (self.square / self.weight - mean.square()).clamp(min=1e-6)
-        return mean, variance.sqrt()
+        return ReturnStatistics(mean, variance.sqrt())
 
-    def value(self, obs: Tensor, extras: Tensor) -> Tensor:
-        """(R, *shape), (R, X) -> (R,) expected returns."""
+    def value(self, obs: Shaped[Tensor, "R *shape"], extras: Float[Tensor, "R X"]) -> Float[Tensor, " R"]:
+        """Expected returns."""
         mean, deviation = self.statistics()
         return self(obs, extras).squeeze(-1) * deviation + mean
 

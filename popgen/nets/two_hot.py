@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 
@@ -12,17 +13,19 @@ class TwoHot(nn.Module):
     An odd number of bins keeps one at 0. `limit` is in symlog units: 7 covers returns of about +-1,100.
     """
 
+    bins: Tensor
+
     def __init__(self, bins: int, limit: float = 7.0) -> None:
         super().__init__()
         half = torch.expm1(torch.linspace(0.0, limit, bins // 2 + 1))[1:]
         middle = torch.zeros(bins % 2)
         self.register_buffer("bins", torch.cat([-half.flip(0), middle, half]), persistent=False)
 
-    def mean(self, logits: Tensor) -> Tensor:
-        """(..., K) -> (...), the expected value."""
+    def mean(self, logits: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
+        """The expected value."""
         return (torch.softmax(logits.float(), -1) * self.bins).sum(-1)
 
-    def loss(self, logits: Tensor, target: Tensor) -> Tensor:
+    def loss(self, logits: Float[Tensor, "*batch K"], target: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Cross-entropy (...) of the two-hot encoding of `target` (...) under logits (..., K)."""
         bins = self.bins
         target = target.detach().clamp(float(bins[0]), float(bins[-1])).contiguous()

@@ -28,7 +28,7 @@ def load_weights(module: nn.Module, weights: Mapping[str, np.ndarray], *, cast: 
         raise ValueError(f"tensor {missing[0]!r} is missing")
     if unknown := sorted(weights.keys() - own.keys()):
         raise ValueError(f"tensor {unknown[0]!r} is not one of the policy's")
-    loaded = {name: torch.from_numpy(np.array(weights[name])) for name in own}
+    loaded = {name: torch.as_tensor(np.array(weights[name])) for name in own}
     for name, tensor in own.items():
         if loaded[name].shape != tensor.shape:
             raise ValueError(f"tensor {name!r} has shape {tuple(loaded[name].shape)}, expected {tuple(tensor.shape)}")
@@ -58,7 +58,7 @@ def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, np.ndarray]:
 
 
 def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, np.ndarray]) -> None:
-    """Take over `optimiser_state` of an optimiser over the same parameters.
+    """Replace the contents with `optimiser_state` of an optimiser over the same parameters.
 
     Raises:
         ValueError: a parameter's moments or step count are missing, of another shape, of no parameter, or below 0.
@@ -67,7 +67,7 @@ def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, np.n
     state: dict[int, dict[str, torch.Tensor]] = {}
     for key, value in saved.items():
         index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = torch.from_numpy(np.array(value))
+        state.setdefault(int(index), {})[name] = torch.as_tensor(np.array(value))
     for index, slots in state.items():
         shape = parameters[index].shape if 0 <= index < len(parameters) else None
         wanted = {**dict.fromkeys(_MOMENTS, shape), "step": torch.Size()}

@@ -16,9 +16,10 @@ class Remembering(Protocol):
 
     def memory(self) -> dict[str, Any]:
         """Everything since `reset` that the next actions depend on, the generator included: arrays and plain values."""
+        ...
 
     def load_memory(self, memory: dict[str, Any]) -> None:
-        """Go on from `memory()` of a policy with the same weights and batch."""
+        """Continue from `memory()` of a policy with the same weights and batch."""
 
 
 @runtime_checkable
@@ -50,12 +51,15 @@ class Policy(Protocol):
         Returns:
             (B, P) uint8: column p is the action this policy would take in seat p.
         """
+        ...
 
     def config(self) -> dict[str, Any]:
         """JSON-able settings, with the weights enough to build the policy again."""
+        ...
 
     def weights(self) -> dict[str, np.ndarray]:
         """Name -> array of everything learned that `act` needs; empty if nothing is."""
+        ...
 
     @classmethod
     def from_parts(cls, config: Mapping[str, Any], weights: Mapping[str, np.ndarray], spec: EnvSpec) -> Self:
@@ -64,3 +68,4 @@ class Policy(Protocol):
         Raises:
             ValueError: the parts do not fit each other or the environment.
         """
+        ...

@@ -76,15 +76,16 @@ class Seating:
         self._first = np.asarray(done, bool).copy()
 
     def state(self) -> dict[str, Any]:
-        """Everything to go on from exactly here: last actions, first steps and the policies' memories."""
-        memories = {str(k): self.policies[k].memory() for k in self._remembering()}
+        """Everything to continue from exactly here: last actions, first steps and the policies' memories."""
+        memories = {str(k): policy.memory() for k, policy in self._remembering_policies().items()}
         return {"actions": self._actions.copy(), "first": self._first.copy(), "memories": memories}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state()` of the same seats and policies."""
+        """Continue from `state()` of the same seats and policies."""
         self._actions, self._first = np.array(state["actions"]), np.array(state["first"])
-        for k in self._remembering():
-            self.policies[k].load_memory(state["memories"][str(k)])
+        for k, policy in self._remembering_policies().items():
+            policy.load_memory(state["memories"][str(k)])
 
-    def _remembering(self) -> list[int]:
-        return [k for k, _ in self._rows if isinstance(self.policies[k], Remembering)]
+    def _remembering_policies(self) -> dict[int, Remembering]:
+        seated = ((k, self.policies[k]) for k, _ in self._rows)
+        return {k: policy for k, policy in seated if isinstance(policy, Remembering)}

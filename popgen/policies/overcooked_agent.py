@@ -39,13 +39,15 @@ class OvercookedAgent(Agent):
             raise ValueError(f"seat must be 0 or 1, got {seat!r}")
         self._policy, self._env, self._seat = policy, env, seat
         self._seeds = np.random.default_rng(seed)
+        self._previous: tuple[np.ndarray, int] | None = None
+        self.agent_index: int | None = seat
         super().__init__()
 
     def reset(self) -> None:
         """Start a new episode; the seat stays."""
         super().reset()
         self.agent_index = self._seat
-        self._previous: tuple[np.ndarray, int] | None = None
+        self._previous = None
         self._policy.reset(1, int(self._seeds.integers(2**31)))
 
     def set_agent_index(self, agent_index: int | None) -> None:

@@ -68,7 +68,7 @@ class MappoConfig(PPOConfig):
         config.env_runners(
             env_runner_cls=BatchedRunner,
             num_env_runners=ppo.runners,
-            num_cpus_per_env_runner=cluster.sampler_cpus,
+            num_cpus_per_env_runner=cluster.sampler_cpus,  # pyright: ignore[reportArgumentType]
             custom_resources_per_env_runner=dict(cluster.resources),
             validate_env_runners_after_construction=False,
             merge_env_runner_states=False,
@@ -105,19 +105,23 @@ def _no_mapping(agent: Any, *arguments: Any, **kwargs: Any) -> str:
 class Mappo(PPO):
     """One iteration: choose each member's partner, sample, learn. The driver reads `report` after `train()`."""
 
-    @classmethod
-    def get_default_config(cls) -> MappoConfig:
-        """RLlib's hook."""
-        return MappoConfig()
+    config: MappoConfig  # RLlib makes these three
+    learner_group: Any
+    env_runner_group: Any
 
-    def setup(self, config: MappoConfig) -> None:
-        """Runners, learner, and what the training step remembers."""
-        super().setup(config)
-        self.job: Job = self.config.job
+    def __init__(self, config: MappoConfig, *arguments: Any, **keywords: Any) -> None:
+        assert config.job is not None
+        self.job = config.job
         self.matches = self.job.matches()
         self.played = PlayRecord(self.job)
         self.lost: set[int] = set()
         self.rounds, self.report = 0, Report()
+        super().__init__(config, *arguments, **keywords)
+
+    @classmethod
+    def get_default_config(cls) -> MappoConfig:
+        """RLlib's hook."""
+        return MappoConfig()
 
     def _setup_logdir(self) -> None:
         """Nothing: RLlib would make an empty folder in the user's home for every training."""

@@ -50,6 +50,9 @@ class BatchedRunner(EnvRunner):
     The learners' weights come with each request, so that a runner that was restarted, or missed one, is never stale.
     """
 
+    config: Any  # a MappoConfig
+    module: Any  # a MultiRLModule
+
     def __init__(self, *, config: Any, **kwargs: Any) -> None:
         super().__init__(config=config, **kwargs)
         job: Job = self.config.job
@@ -93,9 +96,10 @@ class BatchedRunner(EnvRunner):
     def _load_actors(self, weights: Mapping[int, Weights]) -> dict[int, Actor]:
         actors = dict(self.frozen)
         for member in self.job.learning:
-            actors[member] = self.module[module_id(member)].unwrapped().actor
+            actor = self.module[module_id(member)].unwrapped().actor
             if member in weights:
-                load_weights(actors[member], weights[member])
+                load_weights(actor, weights[member])
+            actors[member] = actor
         return actors
 
     def _frozen_actor(self, weights: Weights) -> FeedForwardNet:

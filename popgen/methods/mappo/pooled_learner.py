@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,8 +17,9 @@ from torch import Tensor
 
 from popgen.losses.ppo import clipped_surrogate, negated_surrogate
 from popgen.losses.schedules import annealed
-from popgen.methods.mappo.pooling import Plan, pool
+from popgen.methods.mappo.pooling import Plan, PooledBatch, pool
 from popgen.methods.mappo.rl_module import CRITICS, MemberModule, module_id
+from popgen.methods.mappo.slots import Rollout
 from popgen.nets.weights import Weights, load_optimiser_state, load_weights, optimiser_state, weights_of
 
 NETWORKS = ("actor", CRITICS)
@@ -32,11 +33,13 @@ class PooledLearner(PPOTorchLearner):
     are pooled before (`popgen.methods.mappo.pooling`). Everything else of the update is RLlib's.
     """
 
-    def build(self) -> None:
-        """Modules, optimisers, and the generator of the minibatches' order."""
-        super().build()
+    config: Any  # a MappoConfig
+    module: Any  # a MultiRLModule
+
+    def __init__(self, **keywords: Any) -> None:
+        super().__init__(**keywords)
         job = self.config.job
-        self._order = torch.Generator().manual_seed(job.seed)
+        self._order = torch.Generator().manual_seed(job.seed)  # of the minibatches
         self._view = self.config.env_spec.views[job.ppo.view]
         self._sums: dict[str, dict[str, list[Tensor]]] = {}
         self._figures: dict[int, dict[str, float]] = {}
@@ -66,10 +69,11 @@ class PooledLearner(PPOTorchLearner):
         self._anneal_rates(progress)
         self._sums, self._figures = defaultdict(lambda: defaultdict(list)), {}
         self.seconds, began = {"pooling": 0.0, "gradients": 0.0}, time.perf_counter()
-        batches = {}
+        batches: dict[int, PooledBatch] = {}
+        rollouts = cast("Sequence[Rollout]", training_data.episodes)
         for member, plan in plans.items():
             batch = pool(
-                training_data.episodes,
+                rollouts,
                 member,
                 plan,
                 self._module_of(member).critics,
@@ -83,7 +87,7 @@ class PooledLearner(PPOTorchLearner):
                 self._figures[member] = dict(batch.figures)
         # With a runner lost there may be fewer rows than minibatches.
         count = min([ppo.minibatches, *(len(batch.action) for batch in batches.values())])
-        steps = sum(rollout.steps for rollout in training_data.episodes) // count
+        steps = sum(rollout.steps for rollout in rollouts) // count
         self.seconds["pooling"] = time.perf_counter() - began
         for _ in range(ppo.epochs):
             parts = {m: batch.minibatches(count, self._order) for m, batch in batches.items()}

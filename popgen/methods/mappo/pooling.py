@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from popgen.envs.contract import ViewSpec
 from popgen.losses.diversity import signed_advantage
@@ -189,7 +189,7 @@ def pool(
     rollouts: Sequence[Rollout],
     member: int,
     plan: Plan,
-    critics: Mapping[str, ValueNet],
+    critics: Mapping[str, ValueNet] | nn.ModuleDict,
     view: ViewSpec,
     *,
     discount: float,
@@ -206,6 +206,7 @@ def pool(
         if played is None or not bool(played.trained.any()):
             continue
         critic = critics[name]
+        assert isinstance(critic, ValueNet)
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
         counted = played.trained.any(-1)
         chosen = advantage[counted]

@@ -26,9 +26,11 @@ class MemberModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     Built from `model_config`: view (ViewSpec), actions, players, sizes (Sizes), critics (names), seed.
     """
 
-    def setup(self) -> None:
-        """Make the networks; their initial weights depend on the seed alone."""
-        config = self.model_config
+    model_config: dict[str, Any]
+
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        config = self.model_config  # initial weights depend on its seed alone
         view, sizes, players = config["view"], config["sizes"], config["players"]
         generator = torch.Generator().manual_seed(config["seed"])
         self.actor = FeedForwardNet(view, config["actions"], players, sizes)

@@ -18,6 +18,9 @@ class Actor(nn.Module):
     `actor_input=latent` drops h, the paper's literal pi(a^i | z^i).
     """
 
+    masks: Tensor
+    seats: Tensor
+
     def __init__(self, config: AgentConfig, model: WorldModelConfig, num_actions: int) -> None:
         super().__init__()
         self.config = config
@@ -58,6 +61,8 @@ class Critic(nn.Module):
 
     The seat of agent j tells the two seatings of a cross-play pair apart; in self-play it is 0.
     """
+
+    seats: Tensor
 
     def __init__(self, config: AgentConfig, model: WorldModelConfig) -> None:
         super().__init__()

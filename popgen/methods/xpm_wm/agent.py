@@ -8,20 +8,23 @@ By REINFORCE, as in the paper, or by PPO's clipped surrogate in several passes o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec
-from popgen.losses.diversity import signed_advantage
-from popgen.losses.ppo import clipped_loss
-from popgen.losses.reinforce import reinforce
 from popgen.losses.schedules import geometric, linear
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent_networks import SELF, AgentNetworks
+from popgen.methods.xpm_wm.agent_targets import (
+    Losses,
+    PolicyTarget,
+    cross_play_target,
+    sample_losses,
+    self_play_target,
+)
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.imagination import Imagined, imagine
 from popgen.methods.xpm_wm.imagined_play import (
@@ -37,40 +40,6 @@ from popgen.methods.xpm_wm.start_states import Starts
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
 from popgen.play.partner_strength import any_or_strongest
-from popgen.types import Kind
-
-LEAST_SPREAD = 0.1
-"""Of self-play's advantages, in units of reward: where nothing is at stake, noise is not blown up."""
-
-
-@dataclass(frozen=True)
-class PolicyTarget:
-    """What one kind of imagined play teaches.
-
-    Attributes:
-        samples: for the policy and for the critic of that play.
-        unit: of all advantages of the update, which self-play sets.
-        figures: for the logs.
-    """
-
-    samples: Samples
-    unit: Tensor
-    figures: dict[str, float]
-
-
-class Losses(NamedTuple):
-    """Of the policy and of a critic, to be minimised, and the policy's figures."""
-
-    policy: Tensor
-    critic: Tensor
-    figures: dict[str, float]
-
-
-class PolicyTerms(NamedTuple):
-    """Log-probability of the actions taken and entropy, both (R, K)."""
-
-    log_prob: Tensor
-    entropy: Tensor
 
 
 def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) -> torch.dtype:  # noqa: B008
@@ -222,52 +191,18 @@ class AgentLearner:
     # ---- what a batch teaches ------------------------------------------------------------------------------------
 
     def self_play(self, imagined: Imagined) -> PolicyTarget:
-        """+J_SP, which sets the unit of all advantages: the range of the returns or the advantages' spread."""
-        steps, batch = imagined.reward.shape
-        players = torch.tensor([0, 1], device=self.device).expand(batch, 2)
-        returns, value = self.networks.targets(imagined, SELF, players[:, 0].expand(steps + 1, batch))
-        advantage, scale = returns - value[:-1], self.networks.scale.update(returns)
-        unit = scale
-        if self.config.advantage_unit == "spread":  # centred as usual: a shift of all advantages only adds noise
-            running = advantage[imagined.running > 0.5]
-            advantage, unit = advantage - running.mean(), running.std().clamp(min=LEAST_SPREAD)
-        signed = signed_advantage(Kind.SP, advantage, weight=1.0, scale=unit)
-        figures = {
-            "entropy_scale": self.entropy_now(),
-            "return_scale": float(scale),
-            "imagined_shaped_sp": float(imagined.reward.mean()),
-            "imagined_return_sp": float(returns.mean()),
-            "value_sp": float(value.mean()),
-            "advantage_sp": float(advantage.std()),
-        }
-        samples = Samples.from_imagined(imagined, SELF, players, returns, signed, self.entropy_now())
-        return PolicyTarget(self._add_log_probs(samples), unit, figures)
+        """+J_SP, which sets the unit of all advantages."""
+        return self_play_target(self.networks, imagined, self.entropy_now())
 
     def cross_play(self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor) -> PolicyTarget:
-        """-lambda_XP J_XP, in self-play's unit."""
-        steps, batch = imagined.reward.shape
-        returns, value = self.networks.targets(imagined, partner, seats.expand(steps + 1, batch))
-        advantage, weight = returns - value[:-1], self.lambda_now()
-        signed = signed_advantage(Kind.XP, advantage, weight=weight, scale=unit)
-        reward = float(imagined.reward.mean())
+        """-lambda_XP J_XP, in self-play's unit; what is earned with the partner is remembered."""
+        weight = self.lambda_now()
+        target = cross_play_target(
+            self.networks, imagined, partner, seats, unit=unit, weight=weight, entropy_scale=self.entropy_now() * weight
+        )
+        reward = target.figures["imagined_shaped_xp"]
         self.imagined_scores[partner] = 0.95 * self.imagined_scores.get(partner, reward) + 0.05 * reward
-        figures = {
-            "imagined_shaped_xp": reward,
-            "imagined_return_xp": float(returns.mean()),
-            "advantage_xp": float(advantage.std()),
-            "lambda": weight,
-            "partner": float(partner),
-        }
-        scale = self.entropy_now() * weight
-        samples = Samples.from_imagined(imagined, partner, seats.unsqueeze(-1), returns, signed, scale)
-        return PolicyTarget(self._add_log_probs(samples), unit, figures)
-
-    def _add_log_probs(self, samples: Samples) -> Samples:
-        """With those of the actions under the present policy, where the surrogate compares with them."""
-        if self.config.surrogate == "reinforce":
-            return samples
-        with torch.no_grad():
-            return replace(samples, log_prob=policy_terms(self.actor, samples).log_prob)
+        return target
 
     # ---- losses --------------------------------------------------------------------------------------------------
 
@@ -293,20 +228,7 @@ class AgentLearner:
 
     def losses(self, samples: Samples) -> Losses:
         """Of the policy and of the critic of the samples."""
-        policy, figures = self._policy_loss(samples)
-        errors = self.networks.critic(samples.key).loss(samples.latent, samples.seat, samples.returns)
-        return Losses(policy, (samples.running * errors).mean(), figures)
-
-    def _policy_loss(self, samples: Samples) -> tuple[Tensor, dict[str, float]]:
-        log_prob, entropy = policy_terms(self.actor, samples)
-        advantage, running = samples.advantage.unsqueeze(-1), samples.running.unsqueeze(-1)
-        figures = {"entropy": float(entropy.detach().mean())}
-        if samples.log_prob is None:
-            return reinforce(log_prob, advantage, entropy, running, entropy_scale=samples.entropy_scale), figures
-        terms, clip = (log_prob, samples.log_prob, advantage, entropy, running), self.config.clip
-        change = (log_prob.detach() - samples.log_prob).exp() - 1.0
-        figures["clipped"] = float((change.abs() > clip).float().mean())
-        return clipped_loss(*terms, clip=clip, entropy_scale=samples.entropy_scale), figures
+        return sample_losses(self.networks, samples)
 
     # ---- what is kept --------------------------------------------------------------------------------------------
 
@@ -333,12 +255,3 @@ class AgentLearner:
         self.updates, self.playing = int(state["updates"]), int(state["playing"])
         self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
         self.imagined_scores = {int(k): float(v) for k, v in state["imagined_scores"].items()}
-
-
-def policy_terms(actor: Actor, samples: Samples) -> PolicyTerms:
-    """Log-probability of the actions taken and entropy under `actor`."""
-    latent, seats = samples.latent, samples.seats
-    shown = Latent(*(x.unsqueeze(1).expand(*seats.shape, x.shape[-1]) for x in (latent.h, latent.z)))
-    log_probs = actor.log_probs(shown, seats)
-    taken = log_probs.gather(-1, samples.actions.unsqueeze(-1)).squeeze(-1)
-    return PolicyTerms(taken, -(log_probs.exp() * log_probs).sum(-1))

@@ -8,7 +8,7 @@ from popgen.methods.xpm_wm.config import OPEN_LOOP
 from popgen.methods.xpm_wm.latents import Latent
 from popgen.methods.xpm_wm.replay import Windows
 from popgen.methods.xpm_wm.world_model import WorldModel
-from popgen.methods.xpm_wm.world_model_learner import Batch, ModelLearner
+from popgen.methods.xpm_wm.world_model_learner import ModelLearner, WindowBatch
 from popgen.methods.xpm_wm.world_model_losses import event_counts
 
 
@@ -21,7 +21,7 @@ def model_report(learner: ModelLearner, windows: Windows, context: int) -> dict[
     Windows in which an episode begins after the context are left out.
     """
     model = learner.model
-    batch = Batch.of(windows, model)
+    batch = WindowBatch.from_windows(windows, model)
     end = context + OPEN_LOOP
     keep = ~batch.is_first[context:end].any(0)
     obs, actions = batch.obs[:, keep], batch.actions[:, keep]
@@ -32,24 +32,26 @@ def model_report(learner: ModelLearner, windows: Windows, context: int) -> dict[
         t = context + step - 1
         latent = model.step(latent, actions[t], learner.generator)
         if step in (1, OPEN_LOOP):
-            figures |= _at(model, latent, obs[t], batch.events[t, keep], f"step{step}")
+            figures |= _compare_step(model, latent, obs[t], batch.events[t, keep], f"step{step}")
     return figures
 
 
-def _at(model: WorldModel, latent: Latent, obs: torch.Tensor, events: torch.Tensor, label: str) -> dict[str, float]:
+def _compare_step(
+    model: WorldModel, latent: Latent, obs: torch.Tensor, events: torch.Tensor, label: str
+) -> dict[str, float]:
     spec = model.spec
     logits = model.event_logits(latent).unflatten(-1, (spec.num_players, spec.num_events))
     counts = event_counts(logits.unsqueeze(0), events.unsqueeze(0), torch.ones(1, len(events), device=events.device))
     figures = {f"exact_{label}": float(model.exact(model.decode(latent), obs).float().mean())}
-    figures[f"event_precision_{label}"] = _ratio(counts["hits"].sum(), counts["predicted"].sum())
-    figures[f"event_recall_{label}"] = _ratio(counts["hits"].sum(), counts["actual"].sum())
+    figures[f"event_precision_{label}"] = _share_of(counts["hits"].sum(), counts["predicted"].sum())
+    figures[f"event_recall_{label}"] = _share_of(counts["hits"].sum(), counts["actual"].sum())
     for index, name in enumerate(spec.event_names):
         if counts["actual"][index] > 0:
-            figures[f"recall_{name}_{label}"] = _ratio(counts["hits"][index], counts["actual"][index])
+            figures[f"recall_{name}_{label}"] = _share_of(counts["hits"][index], counts["actual"][index])
         if counts["predicted"][index] > 0:
-            figures[f"precision_{name}_{label}"] = _ratio(counts["hits"][index], counts["predicted"][index])
+            figures[f"precision_{name}_{label}"] = _share_of(counts["hits"][index], counts["predicted"][index])
     return figures
 
 
-def _ratio(hits: torch.Tensor, of: torch.Tensor) -> float:
+def _share_of(hits: torch.Tensor, of: torch.Tensor) -> float:
     return float(hits / of) if of > 0 else 0.0

@@ -43,8 +43,17 @@ class Samples:
         steps, batch = imagined.reward.shape
         seats = seats.expand(steps, batch, -1)
         latent, actions = imagined.latent[:-1], imagined.actions.gather(-1, seats)
-        flat = (x.flatten(0, 1) for x in (seats[..., 0], returns, seats, actions, advantage, imagined.running))
-        return Samples(key, Latent(latent.h.flatten(0, 1), latent.z.flatten(0, 1)), *flat, entropy_scale)
+        return Samples(
+            key=key,
+            latent=Latent(latent.h.flatten(0, 1), latent.z.flatten(0, 1)),
+            seat=seats[..., 0].flatten(0, 1),
+            returns=returns.flatten(0, 1),
+            seats=seats.flatten(0, 1),
+            actions=actions.flatten(0, 1),
+            advantage=advantage.flatten(0, 1),
+            running=imagined.running.flatten(0, 1),
+            entropy_scale=entropy_scale,
+        )
 
     def __len__(self) -> int:
         return len(self.returns)

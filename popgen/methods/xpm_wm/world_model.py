@@ -14,6 +14,7 @@ learning need. Latents are class-major, see `popgen.methods.xpm_wm.latents`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -45,6 +46,8 @@ class JointEncoder(nn.Module):
 
     Grid views are centred first (`center`, see `WorldModel.set_outputs`): what never changes would fill the layers.
     """
+
+    center: Tensor
 
     def __init__(self, config: WorldModelConfig, view: ViewSpec) -> None:
         super().__init__()
@@ -93,7 +96,8 @@ class PlayerDecoder(nn.Module):
 
     @property
     def output(self) -> nn.Parameter:
-        return self.trunk[-1].bias if self.conv is None else self.conv.bias
+        """The last bias, one number for each of the observation's."""
+        return _last_bias(self.trunk) if self.conv is None else self.conv.bias
 
     def forward(self, inputs: Tensor) -> Tensor:
         hidden = self.trunk(inputs)
@@ -102,6 +106,8 @@ class PlayerDecoder(nn.Module):
 
 class LatentFilter(nn.Module):
     """Encoder, recurrent state model and posterior: what tracks the latent state of a running episode."""
+
+    maxima: Tensor | None
 
     def __init__(self, config: WorldModelConfig, spec: EnvSpec) -> None:
         super().__init__()
@@ -115,7 +121,7 @@ class LatentFilter(nn.Module):
         step_inputs = self.latent_size + 2 * self.num_actions
         self.step_net = None
         if config.recurrent_units:
-            style = _style(config) | {"units": config.recurrent_units}
+            style: dict[str, Any] = {**_style(config), "units": config.recurrent_units}
             self.step_net = mlp(step_inputs + config.deter, None, **style, layers=1)
             step_inputs = config.recurrent_units
         self.gru = NormGRUCell(step_inputs, config.deter)
@@ -212,6 +218,9 @@ class WorldModel(nn.Module):
         KeyError: the environment has no view of the configured name.
     """
 
+    masks: Tensor
+    event_weights: Tensor
+
     def __init__(self, config: WorldModelConfig, spec: EnvSpec) -> None:
         super().__init__()
         self.config, self.spec = config, spec
@@ -293,11 +302,12 @@ class WorldModel(nn.Module):
         obs_mean, event_mean = obs.mean((0, 1)), events.mean((0, 1))
         biases = torch.logit(obs_mean, eps=1e-3) if self.logits else obs_mean
         for decoder, bias in zip(self.decoders, biases, strict=True):
+            assert isinstance(decoder, PlayerDecoder)
             decoder.output.copy_(bias)
         if self.filter.encoder.conv is not None:
             self.filter.encoder.center.copy_(obs_mean)
-        self.event_head[-1].bias.copy_(torch.logit(event_mean, eps=1e-3))
-        self.continue_head[-1].bias.fill_(4.0)
+        _last_bias(self.event_head).copy_(torch.logit(event_mean, eps=1e-3))
+        _last_bias(self.continue_head).fill_(4.0)
 
     def exact(self, decoded: Tensor, obs: Tensor) -> Tensor:
         """(...,) bool: every number of both players' observations is right after rounding."""
@@ -316,5 +326,11 @@ def bernoulli_loss(logits: Tensor, target: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, target, reduction="none")
 
 
-def _style(config: WorldModelConfig) -> dict[str, object]:
+def _last_bias(net: nn.Sequential) -> nn.Parameter:
+    last = net[-1]
+    assert isinstance(last, nn.Linear) and isinstance(last.bias, nn.Parameter)
+    return last.bias
+
+
+def _style(config: WorldModelConfig) -> dict[str, Any]:
     return {"units": config.units, "activation": config.activation, "norm": config.norm}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from popgen.types import Kind
 
 
 @dataclass(frozen=True)
-class Batch:
+class WindowBatch:
     """Windows as tensors, time first; see `popgen.methods.xpm_wm.replay.Windows`."""
 
     obs: Tensor
@@ -33,7 +33,7 @@ class Batch:
     cross: Tensor
 
     @staticmethod
-    def of(windows: Windows, model: WorldModel) -> Batch:
+    def from_windows(windows: Windows, model: WorldModel) -> WindowBatch:
         """Batch-first arrays -> time-first tensors on the model's device, observations scaled."""
         device = next(model.parameters()).device
 
@@ -41,7 +41,7 @@ class Batch:
             return torch.from_numpy(np.ascontiguousarray(array)).to(device).transpose(0, 1)
 
         cross = torch.from_numpy(windows.kind == KIND_CODE[Kind.XP]).to(device)
-        return Batch(
+        return WindowBatch(
             obs=model.filter.scaled(tensor(windows.obs)),
             actions=tensor(windows.actions),
             events=tensor(windows.events).float(),
@@ -50,6 +50,14 @@ class Batch:
             partner=torch.from_numpy(windows.partner).to(device),
             cross=cross,
         )
+
+
+class ModelLosses(NamedTuple):
+    """Unweighted loss terms, averaged over (T, B); the observed window; tensors worth logging."""
+
+    terms: dict[str, Tensor]
+    seen: Observed
+    extras: dict[str, Tensor]
 
 
 class ModelLearner:
@@ -84,11 +92,11 @@ class ModelLearner:
 
     def set_biases(self, windows: Windows) -> None:
         """Output biases at the data's means; call once before the first update."""
-        batch = Batch.of(windows, self.model)
+        batch = WindowBatch.from_windows(windows, self.model)
         self.model.set_outputs(batch.obs, batch.events.flatten(2))
 
-    def losses(self, batch: Batch) -> tuple[dict[str, Tensor], Observed, dict[str, Tensor]]:
-        """Unweighted loss terms (T, B)-averaged, the observed window, and tensors worth logging."""
+    def losses(self, batch: WindowBatch) -> ModelLosses:
+        """The terms of equation WM+ on a batch."""
         model, config = self.model, self.config
         seen = model.observe(batch.obs, batch.actions, batch.is_first, self.generator)
         inner = (~batch.is_first).float()
@@ -106,9 +114,9 @@ class ModelLearner:
             "predecessors": self._predecessor_loss(batch, seen),
         }
         extras = {"kl": losses.masked_mean(kl, inner), "exact": model.exact(decoded.detach(), batch.obs).float().mean()}
-        return terms, seen, extras
+        return ModelLosses(terms, seen, extras)
 
-    def _predecessor_loss(self, batch: Batch, seen: Observed) -> Tensor:
+    def _predecessor_loss(self, batch: WindowBatch, seen: Observed) -> Tensor:
         total = torch.zeros((), device=self.device)
         if not self.config.kl_predecessors or not self.predecessors:
             return total
@@ -144,10 +152,11 @@ class ModelLearner:
         Raises:
             FloatingPointError: the loss or its gradient is not finite; the weights are those of before.
         """
-        batch = Batch.of(windows, self.model)
-        terms, seen, extras = self.losses(batch)
+        batch = WindowBatch.from_windows(windows, self.model)
+        result = self.losses(batch)
+        terms, seen = result.terms, result.seen
         weights = self.loss_weights()
-        loss = sum(weights[name] * term for name, term in terms.items())
+        loss = sum((weights[name] * term for name, term in terms.items()), torch.zeros((), device=self.device))
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
@@ -158,12 +167,12 @@ class ModelLearner:
         self.optimiser.step()
         self.updates += 1
         metrics = {f"loss_{name}": float(term.detach()) for name, term in terms.items()}
-        return metrics | {name: float(value) for name, value in extras.items()}, seen
+        return metrics | {name: float(value) for name, value in result.extras.items()}, seen
 
     @torch.no_grad()
     def posteriors(self, windows: Windows) -> Observed:
         """Windows through the model without learning."""
-        batch = Batch.of(windows, self.model)
+        batch = WindowBatch.from_windows(windows, self.model)
         return self.model.observe(batch.obs, batch.actions, batch.is_first, self.generator)
 
     def starts(
@@ -184,7 +193,7 @@ class ModelLearner:
         return Starts(h, z.numpy(), np.full(count, pool, np.uint8), partner)
 
     def state(self) -> dict[str, Any]:
-        """Weights, optimiser and generators, to go on from exactly here."""
+        """Weights, optimiser and generators, to continue from exactly here."""
         return {
             "model": w.weights_of(self.model),
             "optimiser": w.optimiser_state(self.optimiser),
@@ -194,7 +203,7 @@ class ModelLearner:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over `state()`."""
+        """Replace the contents with `state()`."""
         w.load_weights(self.model, state["model"])
         w.load_optimiser_state(self.optimiser, state["optimiser"])
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))

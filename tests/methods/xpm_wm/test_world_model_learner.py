@@ -15,7 +15,7 @@ from popgen.methods.xpm_wm.latents import from_indices
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.replay import KIND_CODE, Windows
 from popgen.methods.xpm_wm.world_model import LatentFilter, Observed
-from popgen.methods.xpm_wm.world_model_learner import Batch, ModelLearner
+from popgen.methods.xpm_wm.world_model_learner import ModelLearner, WindowBatch
 from popgen.methods.xpm_wm.world_model_losses import predecessor_kl
 from popgen.nets import weights as w
 from popgen.runs.state_files import load_state, save_state
@@ -50,7 +50,7 @@ def test_updates_lower_every_part_of_the_loss(config: WorldModelConfig) -> None:
 
 def test_losses_and_weights_have_the_same_names() -> None:
     learner = make_learner(event_scale=7.0, continue_scale=0.3, kl_predecessors=0.2)
-    terms, _, _ = learner.losses(Batch.of(random_windows(6, 5), learner.model))
+    terms, _, _ = learner.losses(WindowBatch.from_windows(random_windows(6, 5), learner.model))
     assert learner.loss_weights().keys() == terms.keys()
     weights = learner.loss_weights()
     assert (weights["events"], weights["continue"], weights["predecessors"]) == (7.0, 0.3, 0.2)
@@ -64,7 +64,10 @@ def test_nothing_is_predicted_into_a_beginning() -> None:
 
     def terms(given: Windows) -> dict[str, float]:
         learner.generator.manual_seed(0)
-        return {name: float(term.detach()) for name, term in learner.losses(Batch.of(given, learner.model))[0].items()}
+        return {
+            name: float(term.detach())
+            for name, term in learner.losses(WindowBatch.from_windows(given, learner.model))[0].items()
+        }
 
     before = terms(windows)
     events = windows.events.copy()
@@ -74,7 +77,7 @@ def test_nothing_is_predicted_into_a_beginning() -> None:
     assert terms(replace(windows, events=events))["events"] != before["events"]
     # By hand, over the steps that count.
     learner.generator.manual_seed(0)
-    batch = Batch.of(windows, learner.model)
+    batch = WindowBatch.from_windows(windows, learner.model)
     terms, seen, extras = learner.losses(batch)
     kl = (seen.posterior * (seen.posterior.log() - seen.prior.log())).sum((-2, -1))[~batch.is_first].detach()
     weight = learner.config.kl_dyn + learner.config.kl_rep
@@ -125,7 +128,7 @@ def test_the_predecessor_term_is_of_cross_play_rows_and_of_the_right_member(read
     learner = make_learner(kl_predecessors=1.0, predecessors=reading)
     archive = {member: Archived(member) for member in (1, 2, 3)}
     learner.predecessors = archive  # type: ignore[assignment]
-    batch = Batch.of(crossed(random_windows(6, 5), PARTNERS), learner.model)
+    batch = WindowBatch.from_windows(crossed(random_windows(6, 5), PARTNERS), learner.model)
     terms, seen, _ = learner.losses(batch)
     routes = ROUTES[reading]
     for member, archived in archive.items():
@@ -147,7 +150,7 @@ def test_the_predecessor_term_is_of_cross_play_rows_and_of_the_right_member(read
 def test_no_predecessor_term_without_cross_play_or_weight() -> None:
     learner = make_learner(kl_predecessors=1.0)
     learner.predecessors = {1: Archived(1)}  # type: ignore[dict-item]
-    batch = Batch.of(crossed(random_windows(3, 5), [0, 0, 2]), learner.model)
+    batch = WindowBatch.from_windows(crossed(random_windows(3, 5), [0, 0, 2]), learner.model)
     assert float(learner.losses(batch)[0]["predecessors"]) == 0.0
     learner = make_learner(kl_predecessors=0.0)
     learner.predecessors = {2: Archived(2)}  # type: ignore[dict-item]
