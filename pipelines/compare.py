@@ -64,11 +64,13 @@ def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path,
     """An MLflow run for each run compared, with step = number of agents, and one that holds the report."""
     for group in comparison.groups:
         for run in group.runs:
-            tracker = Tracker(tracking, out, f"{group.label}/{group.environment}/s{run.seed}", _params(group, run))
+            tracker = Tracker(
+                tracking, out, f"{group.label}/{group.environment}/s{run.seed}", _describe_run(group, run)
+            )
             for agents, figures in points(comparison, group, run).items():
                 tracker.log(figures, step=agents)
             tracker.finish()
-    tracker = Tracker(tracking, out, "comparison", {"agents": comparison.agents, "runs": len(_runs(comparison))})
+    tracker = Tracker(tracking, out, "comparison", {"agents": comparison.agents, "runs": len(_list_runs(comparison))})
     for path in files.values():
         tracker.log_artifact(path, "comparison")
     tracker.finish()
@@ -92,7 +94,7 @@ def points(comparison: Comparison, group: Group, run: RunRecord) -> dict[int, di
     return found
 
 
-def _params(group: Group, run: RunRecord) -> dict[str, Any]:
+def _describe_run(group: Group, run: RunRecord) -> dict[str, Any]:
     return {
         "label": group.label,
         "method": group.method,
@@ -105,5 +107,5 @@ def _params(group: Group, run: RunRecord) -> dict[str, Any]:
     }
 
 
-def _runs(comparison: Comparison) -> list[RunRecord]:
+def _list_runs(comparison: Comparison) -> list[RunRecord]:
     return [run for group in comparison.groups for run in group.runs]

@@ -9,18 +9,20 @@ from typing import Any
 
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
-from popgen.evaluation.sabotage import Paths, SabotageResult, leave_event, measure_sabotage, to_dict
+from popgen.evaluation.sabotage import SabotageResult, leave_event, measure_sabotage, to_dict
 from popgen.pipelines.run_batch import run_all
 from popgen.population import Population, load_population
 from popgen.progress import Reporter
 from popgen.reports import sabotage_report
-from popgen.reports.paper_figures import METHOD_NAMES
-from popgen.reports.plots import path_grid, path_samples
+from popgen.reports.charts.chart_style import Pictures
+from popgen.reports.charts.path_charts import PathSample, path_grid, path_samples
+from popgen.reports.method_titles import name_of, title_of
+from popgen.reports.paper_figures import SABOTAGE
 from popgen.reports.sabotage_report import TERMINATIONS, build_report, termination_of
 from popgen.runs.ledger import Ledger
 from popgen.types import Kind, LedgerEntry
 
-METHODS = ("lipo", "comedi", "xpm_sim")
+METHODS = tuple(name_of(row.method) for row in SABOTAGE)
 """Rows of the paper's table."""
 
 
@@ -42,7 +44,7 @@ class _Measured:
 
     @property
     def name(self) -> str:
-        return METHOD_NAMES.get(self.source.label, self.source.label)
+        return title_of(self.source.label)
 
     @property
     def file(self) -> str:
@@ -62,18 +64,17 @@ def open_sources(named: Sequence[tuple[str, str | Path]]) -> list[Source]:
     sources: list[Source] = []
     for label, path in named:
         folder = Path(path)
-        inner = folder / "population"
-        population = load_population(inner if (inner / "manifest.json").exists() else folder)
+        population = load_population(folder)
         leave_event(population.spec)
         if not len(population):
             raise UserError(str(path), "has no members yet", "train at least one first")
         source = Source(label, population.path, population)
-        _check_agrees(sources, source)
+        _check_alike(sources, source)
         sources.append(source)
     return sources
 
 
-def _check_agrees(sources: Sequence[Source], new: Source) -> None:
+def _check_alike(sources: Sequence[Source], new: Source) -> None:
     info, seed = new.population.env_info, new.population.manifest.seed
     for known in sources:
         if known.path.resolve() == new.path.resolve():
@@ -124,20 +125,22 @@ def self_sabotage(
     reporter.phase("self-sabotage", len(opened))
     measured = []
     for number, source in enumerate(opened, start=1):
-        measured.append(_measure(source, episodes, seed))
+        measured.append(_measure_source(source, episodes, seed))
         reporter.update(number, population=source.label)
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        steps = _count(folder, measured)
-        report = build_report(measured[0].own.environment, episodes, seed, steps, [_row(one) for one in measured])
-        files = _write(folder, report) | _draw(folder, measured)
+        steps = _record_steps(folder, measured)
+        report = build_report(
+            measured[0].own.environment, episodes, seed, steps, [_describe_population(one) for one in measured]
+        )
+        files = _write_texts(folder, report) | _draw_paths(folder, measured)
     except OSError as error:
         raise UserError(str(folder), f"cannot be written: {error.strerror}", "choose another folder") from error
     return report | {"files": {name: str(path) for name, path in files.items()}}
 
 
-def _measure(source: Source, episodes: int, seed: int) -> _Measured:
+def _measure_source(source: Source, episodes: int, seed: int) -> _Measured:
     """In the environment of its training, and the same play paid by the other rule."""
     termination = termination_of(source.population.env_info.params)
     own = measure_sabotage(source.population, episodes, seed)
@@ -146,7 +149,7 @@ def _measure(source: Source, episodes: int, seed: int) -> _Measured:
     return _Measured(source, termination, own, other)
 
 
-def _count(folder: Path, measured: Sequence[_Measured]) -> int:
+def _record_steps(folder: Path, measured: Sequence[_Measured]) -> int:
     """Enter the evaluation in the experiment's own ledger; every call adds to it. Gives the steps of this call."""
     ledger = Ledger(folder / "ledger.jsonl")
     total = 0
@@ -170,7 +173,7 @@ def _count(folder: Path, measured: Sequence[_Measured]) -> int:
     return total
 
 
-def _row(one: _Measured) -> dict[str, Any]:
+def _describe_population(one: _Measured) -> dict[str, Any]:
     manifest, members = one.source.population.manifest, one.source.population.members
     figures = to_dict(one.own)
     results = {one.termination: one.own, **one.other} if one.termination else {}
@@ -185,14 +188,14 @@ def _row(one: _Measured) -> dict[str, Any]:
         "training_steps": {kind: sum(member.steps.get(kind, 0) for member in members) for kind in kinds},
         **{name: figures[name] for name in ("members", "self_sabotage", "average", "ended_early")},
         **{name: figures[name] for name in ("average_ended_early", "sp", "xp", "landmarks", "matrix", "exits")},
-        "scored": {rule: {"sp": told["sp"], "xp": told["xp"]} for rule, told in paid.items()},
+        "scored": {rule: {"sp": dues["sp"], "xp": dues["xp"]} for rule, dues in paid.items()},
     }
 
 
-def _write(folder: Path, report: Mapping[str, Any]) -> dict[str, Path]:
+def _write_texts(folder: Path, report: Mapping[str, Any]) -> dict[str, Path]:
     texts = {
         "self_sabotage.json": sabotage_report.to_json(report),
-        "self_sabotage.csv": sabotage_report.to_csv(report),
+        "self_sabotage.csv": sabotage_report.members_csv(report),
         "self_sabotage.md": sabotage_report.to_markdown(report),
     }
     for name, text in texts.items():
@@ -200,28 +203,22 @@ def _write(folder: Path, report: Mapping[str, Any]) -> dict[str, Path]:
     return {name: folder / name for name in texts}
 
 
-def _draw(folder: Path, measured: Sequence[_Measured]) -> dict[str, Path]:
+def _draw_paths(folder: Path, measured: Sequence[_Measured]) -> dict[str, Path]:
     """All pairs of each population, and for each rule of termination one pair of each population side by side."""
-    found: dict[str, Path] = {}
-
-    def two(name: str) -> list[Path]:
-        paths = {f"{name}.{suffix}": folder / f"{name}.{suffix}" for suffix in ("png", "svg")}
-        found.update(paths)
-        return [*paths.values()]
-
-    samples: dict[str, list[tuple[str, Paths, tuple[int, int]]]] = {}
+    pictures = Pictures(folder)
+    samples: dict[str, list[PathSample]] = {}
     for one in measured:
         if one.own.paths is None:
             continue
-        title = f"{one.name}, seed {one.source.population.manifest.seed}: one episode of each pair"
-        path_grid(one.own.paths, two(f"paths-{one.file}"), title=title)
+        who = f"{one.name}, seed {one.source.population.manifest.seed}"
+        path_grid(one.own.paths, pictures.add(f"paths-{one.file}"), title=f"{who}: one episode of each pair")
         if one.own.size > 1:
             pair = sample_pair(one.own)
-            told = f"{one.name}, seed {one.source.population.manifest.seed}\nagents {pair[0]} and {pair[1]}"
-            samples.setdefault(one.termination, []).append((told, one.own.paths, pair))
+            title = f"{who}\nagents {pair[0]} and {pair[1]}"
+            samples.setdefault(one.termination, []).append(PathSample(title, one.own.paths, pair))
     for termination, chosen in samples.items():
-        path_samples(chosen, two(f"paths-samples-{termination}" if termination else "paths-samples"))
-    return found
+        path_samples(chosen, pictures.add(f"paths-samples-{termination}" if termination else "paths-samples"))
+    return pictures.files
 
 
 def sample_pair(result: SabotageResult) -> tuple[int, int]:

@@ -23,11 +23,11 @@ def check_different(configs: Sequence[RunConfig]) -> None:
     Raises:
         UserError: they would.
     """
-    seen: set[str] = set()
+    names: set[str] = set()
     for config in configs:
-        if str(config.run.id) in seen:
+        if str(config.run.id) in names:
             raise UserError("run.id", f"two runs are called {config.run.id}", "start different ones, without run.id")
-        seen.add(str(config.run.id))
+        names.add(str(config.run.id))
 
 
 def run_all(configs: Sequence[RunConfig], *, reporter: Reporter) -> list[Path]:
@@ -43,8 +43,6 @@ def run_all(configs: Sequence[RunConfig], *, reporter: Reporter) -> list[Path]:
     Raises:
         UserError: of a run, see `run_population`.
     """
-    from popgen.pipelines.population import run_population  # with Ray, which finished runs do without
-
     folders = []
     for number, config in enumerate(configs, start=1):
         folder = Path(config.run.root) / str(config.run.id)
@@ -53,5 +51,7 @@ def run_all(configs: Sequence[RunConfig], *, reporter: Reporter) -> list[Path]:
             reporter.note(f"run {number} of {len(configs)}: {folder} is finished")
             continue
         reporter.note(f"run {number} of {len(configs)}: {config.method} on {config.env.name}, seed {config.run.seed}")
+        from popgen.pipelines.population import run_population  # with Ray, which finished runs do without
+
         run_population(config, reporter=reporter)
     return folders

@@ -19,7 +19,7 @@ def add(commands: Any) -> None:
         compare,
         "environment steps, time, SP/XP and steps to equal quality of finished runs, against the number of agents",
         "Runs of one method and environment are its seeds. Keys of --json: those of "
-        "popgen/evaluation/comparison_report (runs, costs, scores, quality, budgets, notes) and files.",
+        "popgen/reports/comparison_report (runs, costs, scores, quality, budgets, notes) and files.",
     )
     parser.add_argument(
         "runs", nargs="*", type=named_path, metavar="[NAME=]RUN", help="a run's folder, called NAME and not its method"
@@ -50,7 +50,7 @@ def compare(args: argparse.Namespace) -> int:
     from popgen.config.sections import TrackingConfig
     from popgen.pipelines.compare import EXPERIMENT, compare_runs
     from popgen.progress import make_reporter
-    from popgen.reports.comparison_report import to_tables
+    from popgen.reports.comparison_report import to_sheets
     from popgen.runs.mlflow_tracker import check_uri
 
     tracking = TrackingConfig(enabled=not args.no_tracking, uri=args.tracking_uri, experiment=EXPERIMENT)
@@ -67,5 +67,5 @@ def compare(args: argparse.Namespace) -> int:
     if args.json:
         print_json(report)
         return OK
-    print_report(to_tables(report), report["notes"], args.out, report["files"])
+    print_report([sheet.to_rich() for sheet in to_sheets(report)], report["notes"], args.out, report["files"])
     return OK

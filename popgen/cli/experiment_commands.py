@@ -76,7 +76,7 @@ def self_sabotage(args: argparse.Namespace) -> int:
     methods = args.method or ([] if args.population else ["lipo", "comedi", "xpm_sim"])
     if args.overrides and not methods:
         raise UserError("overrides", "have no use where nothing is trained", "name what to train with --method")
-    from popgen.reports.sabotage_report import NOTES, TERMINATIONS, summary, to_tables
+    from popgen.reports.sabotage_report import NOTES, TERMINATIONS, summary, to_sheets
 
     rules = list(TERMINATIONS) if args.termination == "both" else [args.termination]
     base = [*_rendezvous(args.overrides), "population.size=8", *args.overrides]
@@ -98,7 +98,7 @@ def self_sabotage(args: argparse.Namespace) -> int:
     if args.json:
         print_json(report)
         return OK
-    print_report(to_tables(report), [*NOTES, *summary(report)], args.out, report["files"])
+    print_report([sheet.to_rich() for sheet in to_sheets(report)], [*NOTES, *summary(report)], args.out, report["files"])
     return OK
 
 

@@ -70,7 +70,7 @@ def evaluate(args: argparse.Namespace) -> int:
     out = Path(args.out) if args.out else Path(args.population) / "evaluation"
     check_root(out, 16 * 2**20, "--out")
     from popgen.evaluation.crossplay import evaluate_population
-    from popgen.reports.crossplay_report import summary, to_dict, to_rich, write_report
+    from popgen.reports.crossplay_report import matrix_sheet, summary, to_dict, write_report
 
     with closing(make_reporter(quiet=args.quiet)) as reporter:
         reporter.phase("evaluation", 1)
@@ -81,24 +81,25 @@ def evaluate(args: argparse.Namespace) -> int:
             args.members,
             progress=lambda done, total: reporter.update(done / total, episodes=done),
         )
-    files = write_report(result, out)
+    files, report = write_report(result, out), to_dict(result)
     if args.json:
-        print_json({**to_dict(result), "files": {suffix: str(path) for suffix, path in files.items()}})
+        print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
         return OK
-    print_report([to_rich(result)], summary(result), str(out), [path.name for path in files.values()])
+    table = matrix_sheet(report, narrow=True).to_rich()
+    print_report([table], summary(report), str(out), [path.name for path in files.values()])
     return OK
 
 
 def show(args: argparse.Namespace) -> int:
     """Tell what a population holds."""
     from popgen.population import load_population
-    from popgen.population.show import describe, render
+    from popgen.reports.population_report import describe_population, render_population
 
     population = load_population(args.population)
     if args.json:
-        print_json(describe(population))
+        print_json(describe_population(population))
         return OK
-    print_table(render(population))
+    print_table(render_population(population))
     print(f"population: {population.path}")
     return OK
 

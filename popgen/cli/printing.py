@@ -35,11 +35,3 @@ def print_report(tables: Iterable[Any], lines: Iterable[str], out: str, files: I
     for table in tables:
         print_table(table)
     print("\n".join([*lines, f"report: {out} ({', '.join(files)})"]))
-
-
-def figure_text(figure: Mapping[str, float | None]) -> str:
-    """A mean with its standard error, where it has them."""
-    mean, error = figure["mean"], figure["standard_error"]
-    if mean is None:
-        return "-"
-    return f"{mean:.2f}" if error is None else f"{mean:.2f} ± {error:.2f}"

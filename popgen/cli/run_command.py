@@ -9,7 +9,7 @@ from typing import Any
 
 from popgen.cli.arguments import add_command
 from popgen.cli.compose import compose, to_yaml
-from popgen.cli.printing import OK, figure_text, print_json, print_table
+from popgen.cli.printing import OK, print_json, print_table
 from popgen.cli.training import before_ray
 
 
@@ -70,18 +70,10 @@ def _print_config(values: dict[str, Any], as_json: bool) -> int:
 
 
 def _print_run(result: Mapping[str, Any]) -> None:
-    from rich.table import Table
+    from popgen.reports.crossplay_report import matrix_sheet, summary
 
-    evaluation = result["evaluation"]
-    members, matrix = evaluation["members"], evaluation["matrix"]
-    title = f"{evaluation['environment']['name']}: {evaluation['unit']} per episode (± standard error)"
-    table = Table("seat 0 \\ seat 1", *map(str, members), title=title)
-    for member, means, errors in zip(members, matrix["mean"], matrix["standard_error"], strict=True):
-        cells = ({"mean": mean, "standard_error": error} for mean, error in zip(means, errors, strict=True))
-        table.add_row(str(member), *map(figure_text, cells))
-    print_table(table)
-    beside = "".join(f"   beside {who} {figure_text(row['both'])}" for who, row in evaluation["beside"].items())
-    print(f"SP mean {figure_text(evaluation['sp'])}   XP mean {figure_text(evaluation['xp'])}{beside}")
+    print_table(matrix_sheet(result["evaluation"], narrow=True).to_rich())
+    print("\n".join(summary(result["evaluation"])))
     for who, row in result["ledger"].items():
         kinds = ", ".join(f"{kind} {steps:,}" for kind, steps in row.items() if steps and kind != "total")
         print(f"environment steps, {'all' if who == 'total' else f'member {who}'}: {kinds}")

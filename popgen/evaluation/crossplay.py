@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+import pandas as pd
 
 from popgen.errors import UserError
 from popgen.play.policy import Policy
-from popgen.play.rollout import Episodes, play_teams
+from popgen.play.episodes import Episodes
+from popgen.play.rollout import play_teams
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 from popgen.population.manifest import EnvironmentInfo
 from popgen.population.store import Population
@@ -40,6 +43,11 @@ class Estimate:
             return cls(math.nan, math.nan)
         error = math.sqrt(sum(part.error**2 for part in parts)) / len(parts)
         return cls(float(np.mean([part.mean for part in parts])), error)
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Keys mean and standard_error, as in every JSON report; None where unknown."""
+        values = {"mean": self.mean, "standard_error": self.error}
+        return {name: float(value) if math.isfinite(value) else None for name, value in values.items()}
 
     def below(self, other: Estimate) -> bool:
         """Lower than `other` by more than two standard errors of the difference (0 where they are unknown)."""
@@ -94,6 +102,7 @@ class CrossPlayResult:
         members: ids, in the order of rows and columns.
         episodes: per ordered pair.
         seed: of the evaluation.
+        training_seed: of the population's run.
         steps: environment steps taken, kind `evaluation`.
         pairings: by label of seat 0 and seat 1.
     """
@@ -105,6 +114,7 @@ class CrossPlayResult:
     members: tuple[int, ...]
     episodes: int
     seed: int
+    training_seed: int
     steps: int
     pairings: dict[tuple[str, str], Pairing]
 
@@ -118,12 +128,21 @@ class CrossPlayResult:
         pairing = self.pairings.get((str(seat_0), str(seat_1)))
         return pairing.score if pairing else Estimate(math.nan, math.nan)
 
-    def table(self, labels: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Means and standard errors (K, K): row = seat 0, column = seat 1; NaN where not played."""
-        cells = [[self.score(row, column) for column in labels] for row in labels]
-        return (
-            np.array([[cell.mean for cell in row] for row in cells]).reshape(len(labels), len(labels)),
-            np.array([[cell.error for cell in row] for row in cells]).reshape(len(labels), len(labels)),
+    def to_frame(
+        self, value: Literal["mean", "error"] = "mean", labels: Sequence[int | str] | None = None
+    ) -> pd.DataFrame:
+        """Scores of all pairs: rows are the player in seat 0, columns the player in seat 1; NaN where not played.
+
+        Args:
+            value: the mean, or its standard error.
+            labels: whom to list; None for the members.
+        """
+        names = self.labels if labels is None else tuple(map(str, labels))
+        cells = [[getattr(self.score(row, column), value) for column in names] for row in names]
+        return pd.DataFrame(
+            np.array(cells, dtype=float).reshape(len(names), len(names)),
+            index=pd.Index(names, name="seat_0"),
+            columns=pd.Index(names, name="seat_1"),
         )
 
     @property
@@ -186,7 +205,7 @@ def evaluate_population(
     Raises:
         UserError: no members, an unknown or repeated one, or less than 1 episode.
     """
-    chosen = _chosen(population, members)
+    chosen = _choose_members(population, members)
     if episodes < 1:
         raise UserError("evaluation.episodes", f"must be at least 1, got {episodes}")
     spec = population.spec
@@ -202,7 +221,7 @@ def evaluate_population(
     pairings = {}
     for n, (i, j) in enumerate(matches):
         rows = slice(n * episodes, (n + 1) * episodes)
-        pairings[labels[i], labels[j]] = _pairing((labels[i], labels[j]), played, rows)
+        pairings[labels[i], labels[j]] = _estimate_pairing((labels[i], labels[j]), played, rows)
     return CrossPlayResult(
         environment=population.env_info,
         method=population.manifest.method,
@@ -211,12 +230,13 @@ def evaluate_population(
         members=chosen,
         episodes=episodes,
         seed=seed,
+        training_seed=population.manifest.seed,
         steps=played.steps,
         pairings=pairings,
     )
 
 
-def _chosen(population: Population, members: Sequence[int] | None) -> tuple[int, ...]:
+def _choose_members(population: Population, members: Sequence[int] | None) -> tuple[int, ...]:
     if not len(population):
         raise UserError(str(population.path), "has no members yet", "train at least one first")
     chosen = tuple(range(1, len(population) + 1)) if members is None else tuple(int(member) for member in members)
@@ -228,7 +248,7 @@ def _chosen(population: Population, members: Sequence[int] | None) -> tuple[int,
     return chosen
 
 
-def _pairing(seats: tuple[str, str], played: Episodes, rows: slice) -> Pairing:
+def _estimate_pairing(seats: tuple[str, str], played: Episodes, rows: slice) -> Pairing:
     scores = played.score[rows]
     return Pairing(
         seats=seats,

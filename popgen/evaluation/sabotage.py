@@ -11,7 +11,6 @@ Agent 1 has no earlier agents; as in the paper it stands as 0 and counts in the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -23,7 +22,8 @@ from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import Estimate
 from popgen.play.policy import Policy
-from popgen.play.rollout import Episodes, Transition, play
+from popgen.play.episodes import Episodes
+from popgen.play.rollout import Transition, play
 from popgen.population.store import Population
 
 LEAVES = "leaves"
@@ -178,7 +178,7 @@ def measure_sabotage(
     env = make_env(info.name, len(matches) * episodes, seed=0, **{**info.params, **(params or {})})
     event = env.spec.event_names.index(leave_event(env.spec))
     policies: list[Policy] = [population[member + 1] for member in range(count)]
-    recorder = _Recorder(env)
+    recorder = _PositionRecorder(env)
     played = play(env, policies, np.repeat(matches, episodes, axis=0), seed=seed, record=recorder)
     shape = (count, count, episodes)
     exits = (played.events[..., event] > 0).reshape(*shape, -1)
@@ -192,12 +192,12 @@ def measure_sabotage(
         exits=exits,
         ended=played.terminated.reshape(shape),
         scores=played.score.reshape(shape),
-        landmarks=_landmarks(env, recorder, played, shape),
-        paths=_paths(env, recorder, exits, shape),
+        landmarks=_count_landmarks(env, recorder, played, shape),
+        paths=_first_paths(env, recorder, exits, shape),
     )
 
 
-class _Recorder:
+class _PositionRecorder:
     """Keeps the positions of all rows, step by step."""
 
     def __init__(self, env: BatchedEnv) -> None:
@@ -212,13 +212,13 @@ class _Recorder:
         here = self.env.positions(step.next_states)
         self.positions.append(np.where(step.counted[:, None, None], here, np.nan))
 
-    def all(self) -> np.ndarray:
+    def stack_positions(self) -> np.ndarray:
         """(B, T + 1, P, 2), NaN after the end of an episode."""
         return np.stack(self.positions, axis=1)
 
 
-def _landmarks(
-    env: BatchedEnv, recorder: _Recorder, played: Episodes, shape: tuple[int, int, int]
+def _count_landmarks(
+    env: BatchedEnv, recorder: _PositionRecorder, played: Episodes, shape: tuple[int, int, int]
 ) -> np.ndarray | None:
     """(M, K): self-play episodes that ran to the horizon and ended with both players' centre at a landmark.
 
@@ -227,7 +227,7 @@ def _landmarks(
     if not isinstance(env, Plane) or len(env.landmarks) < 2:
         return None
     rows = np.arange(len(played.length))
-    last = recorder.all()[rows, played.length].mean(axis=1)  # (B, 2)
+    last = recorder.stack_positions()[rows, played.length].mean(axis=1)  # (B, 2)
     between = np.linalg.norm(env.landmarks[:, None] - env.landmarks[None], axis=-1)
     reach = between[~np.eye(len(between), dtype=bool)].min() / 4
     near = np.linalg.norm(last[:, None] - env.landmarks[None], axis=-1) < reach  # (B, K)
@@ -236,11 +236,13 @@ def _landmarks(
     return near.reshape(*shape, -1)[members, members].sum(axis=1)
 
 
-def _paths(env: BatchedEnv, recorder: _Recorder, exits: np.ndarray, shape: tuple[int, int, int]) -> Paths | None:
+def _first_paths(
+    env: BatchedEnv, recorder: _PositionRecorder, exits: np.ndarray, shape: tuple[int, int, int]
+) -> Paths | None:
     """The first episode of each pair."""
     if not isinstance(env, Plane):
         return None
-    positions = recorder.all()
+    positions = recorder.stack_positions()
     first = positions.reshape(*shape, *positions.shape[1:])[:, :, 0]
     return Paths(first, exits[:, :, 0], float(env.bounds), np.asarray(env.landmarks))
 
@@ -259,15 +261,15 @@ def to_dict(result: SabotageResult) -> dict[str, Any]:
         "average": result.average,
         "ended_early": [result.ended_early(m) for m in members],
         "average_ended_early": result.average_ended_early,
-        "sp": _figure(result.sp),
-        "xp": _figure(result.xp),
+        "sp": result.sp.to_dict(),
+        "xp": result.xp.to_dict(),
         "matrix": result.scores.mean(axis=-1).tolist(),
         "exits": result.exits.mean(axis=2).tolist(),
-        "landmarks": _landmark_figures(result),
+        "landmarks": _describe_landmarks(result),
     }
 
 
-def _landmark_figures(result: SabotageResult) -> dict[str, Any] | None:
+def _describe_landmarks(result: SabotageResult) -> dict[str, Any] | None:
     if result.landmarks is None:
         return None
     members = [result.landmark(m) for m in range(1, result.size + 1)]
@@ -277,8 +279,3 @@ def _landmark_figures(result: SabotageResult) -> dict[str, Any] | None:
         "members": members,
         "counts": result.landmarks.tolist(),
     }
-
-
-def _figure(estimate: Estimate) -> dict[str, float | None]:
-    values = {"mean": estimate.mean, "standard_error": estimate.error}
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}

@@ -216,10 +216,15 @@ class Population:
 def load_population(path: str | Path) -> Population:
     """Load and check a population; nothing in it is executed or unpickled.
 
+    Args:
+        path: the population's folder, or that of the run which made it.
+
     Raises:
         UserError: not a population, written by another format version, or any file missing, damaged or ill-fitting.
     """
     path = Path(path)
+    if not (path / MANIFEST).exists() and (path / "population" / MANIFEST).exists():
+        path = path / "population"
     if not (path / MANIFEST).exists():
         raise UserError(str(path), f"is not a population: it has no {MANIFEST}", "give the folder that holds it")
     manifest = _read_manifest(path)

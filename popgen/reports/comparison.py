@@ -17,6 +17,7 @@ import numpy as np
 
 from popgen.errors import UserError
 from popgen.reports import paper_figures as paper
+from popgen.reports.method_titles import METHODS, name_of, title_of
 from popgen.reports.run_record import REAL, MemberRecord, RunRecord, differences
 from popgen.types import Kind
 
@@ -97,12 +98,7 @@ class Group:
     @property
     def name(self) -> str:
         """As charts and tables call it."""
-        return display_name(self.label)
-
-
-def display_name(label: str) -> str:
-    """A method's name as the paper writes it; other labels as they are."""
-    return paper.METHOD_NAMES.get(label, label)
+        return title_of(self.label)
 
 
 def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
@@ -129,7 +125,7 @@ def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
     for members in found.values():
         for run in members[1:]:
             _check_label(members[0], run)
-    order = list(paper.METHOD_NAMES)
+    order = list(METHODS)
     groups = [Group(label, members[0].method, name, tuple(members)) for (name, label), members in found.items()]
     rank = {label: order.index(label) if label in order else len(order) for _, label in found}
     names = list(dict.fromkeys(group.environment for group in groups))
@@ -146,7 +142,7 @@ def _check_environment(first: RunRecord, run: RunRecord) -> None:
     else:
         names = sorted({*here.params, *there.params})
         different = [name for name in names if here.params.get(name) != there.params.get(name)]
-        told = (f"{n} is {_short(here.params.get(n))}, there {_short(there.params.get(n))}" for n in different)
+        told = (f"{n} is {_shorten(here.params.get(n))}, there {_shorten(there.params.get(n))}" for n in different)
         problem = f"{here.name} is not that of {first.path}: {', '.join(told) or 'its rules differ'}"
     raise UserError(str(run.path), problem, "compare runs of one environment")
 
@@ -155,7 +151,7 @@ def _check_label(first: RunRecord, run: RunRecord) -> None:
     """Runs of one label must be seeds of the same thing."""
     name = f"{run.label} on {run.environment.name}"
     if different := differences(first, run):
-        values = f"{_short(run.settings.get(different[0]))}, there {_short(first.settings.get(different[0]))}"
+        values = f"{_shorten(run.settings.get(different[0]))}, there {_shorten(first.settings.get(different[0]))}"
         more = f" and {len(different) - 1} more" if len(different) > 1 else ""
         problem = f"is {name} like {first.path}, but {different[0]} is {values}{more}"
         raise UserError(str(run.path), problem, "tell them apart with NAME=RUN")
@@ -164,7 +160,7 @@ def _check_label(first: RunRecord, run: RunRecord) -> None:
         raise UserError(str(run.path), problem, "give one of them, or tell them apart with NAME=RUN")
 
 
-def _short(value: object) -> str:
+def _shorten(value: object) -> str:
     text = str(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
 
@@ -173,8 +169,8 @@ def costs(run: RunRecord, agents: int) -> list[Cost]:
     """Cumulative cost after 1, 2, ..., max(agents, members) agents; one agent alone is not extrapolated."""
     size = len(run.members)
     total = max(agents, size) if size > 1 else size
-    steps = {kind: _cumulative([m.steps.get(kind, 0) for m in run.members], total) for kind in KINDS}
-    seconds, rule = _cumulative_seconds(run, steps, total), LINE if size > 2 else CONSTANT
+    steps = {kind: _sum_up([m.steps.get(kind, 0) for m in run.members], total) for kind in KINDS}
+    seconds, rule = _sum_seconds(run, steps, total), LINE if size > 2 else CONSTANT
     return [
         Cost(
             agents=m,
@@ -186,7 +182,7 @@ def costs(run: RunRecord, agents: int) -> list[Cost]:
     ]
 
 
-def _cumulative(values: Sequence[float], total: int) -> list[float]:
+def _sum_up(values: Sequence[float], total: int) -> list[float]:
     """Sums after each member, carried on to `total` members by the module's rule."""
     size = len(values)
     members = list(map(float, values))
@@ -199,7 +195,7 @@ def _cumulative(values: Sequence[float], total: int) -> list[float]:
     return list(accumulate(members))
 
 
-def _cumulative_seconds(run: RunRecord, steps: Mapping[str, Sequence[float]], total: int) -> list[float] | None:
+def _sum_seconds(run: RunRecord, steps: Mapping[str, Sequence[float]], total: int) -> list[float] | None:
     """Seconds after each member; of those not trained by their steps. None where a member's are unknown.
 
     Single times depend on what else the machine did, too much for a line through two of them.
@@ -219,7 +215,7 @@ def _cumulative_seconds(run: RunRecord, steps: Mapping[str, Sequence[float]], to
 
 def default_thresholds(environment: str) -> Thresholds | None:
     """SHARE_SP and SHARE_XP of the paper's XPM-WM self-play; None for an environment without dishes in the paper."""
-    scores = paper.scores(environment, "xpm_wm")
+    scores = paper.find_row(environment, paper.OWN_METHOD)
     return None if scores is None else Thresholds(round(SHARE_SP * scores.sp, 2), round(SHARE_XP * scores.sp, 2))
 
 
@@ -299,18 +295,18 @@ def budgets(groups: Sequence[Group], agents: int) -> Iterator[Budget]:
     environments = dict.fromkeys(group.environment for group in groups)
     for environment in environments:
         ours = paper.xpm_wm_budget(environment, agents)
-        for method in ("lipo", "comedi") if ours else ():
+        for title in paper.BASELINES if ours else ():
             for reading in paper.READINGS:
-                steps = paper.baseline_budget(method, agents, reading)
+                steps = paper.baseline_budget(title, agents, reading)
                 ratio = sum(steps.values()) / ours if ours else None
-                yield Budget("paper", method, environment, agents, reading, paper.BASELINE_STEPS, steps, ratio)
+                yield Budget("paper", name_of(title), environment, agents, reading, paper.BASELINE_STEPS, steps, ratio)
     for group in groups:
-        if group.method not in ("lipo", "comedi"):
+        if title_of(group.method) not in paper.BASELINES:
             continue
         for run in group.runs:
             budget = round(float(np.mean([m.steps.get(str(Kind.SP), 0) for m in run.members])))
             for reading in paper.READINGS:
-                steps = paper.baseline_budget(group.method, agents, reading, budget)
+                steps = paper.baseline_budget(title_of(group.method), agents, reading, budget)
                 yield Budget(run.run_id, group.method, group.environment, agents, reading, budget, steps, None)
 
 

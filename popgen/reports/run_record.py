@@ -16,6 +16,7 @@ from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.population import load_population
 from popgen.population.manifest import EnvironmentInfo, MemberInfo
+from popgen.reports.training_curves import Point, read_curves, read_lines
 from popgen.runs.ledger import Ledger, LedgerConflict
 from popgen.types import Kind, LedgerEntry
 
@@ -25,20 +26,6 @@ stand beside it and are never added to it."""
 
 _FREE = ("run.", "cluster.", "tracking.", "population.", "evaluation.", "scale")
 """Settings in which runs may differ and still be seeds of one and the same thing."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """Real play of a member in training: own environment steps so far, self-play, and its strongest cross-play.
-
-    `xp` is None where the member had no partner, or none was played yet. `simulated` are its steps so far in an exact
-    simulator used as dynamics model.
-    """
-
-    step: int
-    sp: float
-    xp: float | None
-    simulated: int = 0
 
 
 @dataclass(frozen=True)
@@ -104,19 +91,19 @@ def read_run(path: str | Path, label: str | None = None) -> RunRecord:
         UserError: no run, one that is not finished, or one whose files are damaged or contradict each other.
     """
     path = Path(path)
-    config = _config(path)
+    config = _read_config(path)
     population = load_population(path / "population")
     wanted = int(config["population"]["size"])
     fix = f"finish it with `popgen run` and run.id={path.name}"
     if len(population) < wanted:
         raise UserError(str(path), f"is unfinished: it has {len(population)} of {wanted} members", fix)
-    scores = _scores(path, fix)
+    scores = _read_scores(path, fix)
     ledger = read_ledger(path / "ledger.jsonl")
     curves = read_curves(path / "metrics.jsonl")
     origin, adopted = config["population"].get("init_from"), 0
     if origin:
         adopted = int(config["population"].get("init_members", 0))
-        curves |= {member: curve for member, curve in _origin_curves(Path(origin)).items() if member <= adopted}
+        curves |= {member: curve for member, curve in _read_origin_curves(Path(origin)).items() if member <= adopted}
     return RunRecord(
         path=path,
         run_id=path.name,
@@ -125,11 +112,11 @@ def read_run(path: str | Path, label: str | None = None) -> RunRecord:
         seed=int(config["run"]["seed"]),
         scale=str(config["scale"]),
         environment=population.env_info,
-        settings=_settings(config),
-        members=tuple(_member(path, info, ledger, curves, info.id <= adopted) for info in population.members),
+        settings=_decisive_settings(config),
+        members=tuple(_record_member(path, info, ledger, curves, info.id <= adopted) for info in population.members),
         evaluation_steps=ledger.steps(kind=Kind.EVALUATION),
-        lost_steps=_lost_steps(path / "ledger.lost.jsonl"),
-        attempts=_attempts(path / "attempts.txt"),
+        lost_steps=_count_lost_steps(path / "ledger.lost.jsonl"),
+        attempts=_count_attempts(path / "attempts.txt"),
         scores=scores,
     )
 
@@ -145,7 +132,7 @@ def planned_run(config: RunConfig, label: str | None = None) -> RunRecord:
         seed=config.run.seed,
         scale=config.scale,
         environment=EnvironmentInfo.of(spec),
-        settings=_settings(config.relevant()),
+        settings=_decisive_settings(config.relevant()),
         members=(),
         evaluation_steps=0,
         lost_steps=0,
@@ -170,7 +157,7 @@ def read_ledger(path: Path) -> Ledger:
         UserError: the file is missing, holds anything else, or contradicts itself.
     """
     ledger = Ledger()
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         try:
             ledger.record(LedgerEntry(**json.loads(line)))
         except (ValueError, TypeError, LedgerConflict) as error:
@@ -179,44 +166,13 @@ def read_ledger(path: Path) -> Ledger:
     return ledger
 
 
-def read_curves(path: Path) -> dict[int, tuple[Point, ...]]:
-    """Real play during training by member, from metrics.jsonl; empty where there is no such file.
-
-    A point's cross-play, the strongest partner's, is the latest that was measured. Of points that a resumed run gave
-    again, the last ones count.
-
-    Raises:
-        UserError: the file holds something else.
-    """
-    if not path.exists():
-        return {}
-    points: dict[int, list[Point]] = {}
-    latest: dict[int, float] = {}
-    for number, line in enumerate(_lines(path), start=1):
-        try:
-            row = json.loads(line)
-            member, step = int(row["member"]), int(row["step"])
-            sp, xp = row.get("real_sp"), row.get("real_xp_max", row.get("real_xp"))
-            simulated = int(row.get("simulated_steps") or 0)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise UserError(str(path), f"line {number} is no point of metrics ({error})", "restore it") from None
-        if xp is not None:
-            latest[member] = float(xp)
-        if sp is not None:
-            found = points.setdefault(member, [])
-            while found and found[-1].step > step:
-                found.pop()
-            found.append(Point(step, float(sp), latest.get(member), simulated))
-    return {member: tuple(found) for member, found in points.items()}
-
-
 def differences(first: RunRecord, second: RunRecord) -> list[str]:
     """Dotted names of the settings in which two runs differ, `run.seed` and places aside."""
     names = sorted({*first.settings, *second.settings})
     return [name for name in names if first.settings.get(name) != second.settings.get(name)]
 
 
-def _config(path: Path) -> dict[str, Any]:
+def _read_config(path: Path) -> dict[str, Any]:
     file = path / "config.json"
     fix = "give a folder that `popgen run` wrote"
     try:
@@ -236,7 +192,7 @@ def _config(path: Path) -> dict[str, Any]:
     return values
 
 
-def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+def _decisive_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Everything that decides the result, flat; the environment is compared by its fingerprint."""
 
     def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -248,7 +204,7 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in flat(config).items() if not name.startswith((*_FREE, "env."))}
 
 
-def _scores(path: Path, fix: str) -> dict[str, Any]:
+def _read_scores(path: Path, fix: str) -> dict[str, Any]:
     file = path / "report" / "crossplay.json"
     try:
         scores = json.loads(file.read_text(encoding="utf-8"))
@@ -261,7 +217,7 @@ def _scores(path: Path, fix: str) -> dict[str, Any]:
     return scores
 
 
-def _member(
+def _record_member(
     path: Path, info: MemberInfo, ledger: Ledger, curves: Mapping[int, tuple[Point, ...]], adopted: bool
 ) -> MemberRecord:
     """A member's figures: of its own run's ledger, or of its record where another run trained it."""
@@ -285,7 +241,7 @@ def _member(
     )
 
 
-def _origin_curves(origin: Path) -> dict[int, tuple[Point, ...]]:
+def _read_origin_curves(origin: Path) -> dict[int, tuple[Point, ...]]:
     """Of the run that members were taken over from, where it is still there."""
     try:
         return read_curves(origin / "metrics.jsonl")
@@ -293,12 +249,12 @@ def _origin_curves(origin: Path) -> dict[int, tuple[Point, ...]]:
         return {}
 
 
-def _lost_steps(path: Path) -> int:
+def _count_lost_steps(path: Path) -> int:
     """Steps of training set aside by resumed runs; a repeated evaluation is set aside there too."""
     if not path.exists():
         return 0
     total = 0
-    for line in _lines(path):
+    for line in read_lines(path):
         try:
             entry = json.loads(line)
             total += int(entry["steps"]) if entry["kind"] != Kind.EVALUATION else 0
@@ -307,14 +263,5 @@ def _lost_steps(path: Path) -> int:
     return total
 
 
-def _attempts(path: Path) -> int:
-    return len(_lines(path)) if path.exists() else 1
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise UserError(str(path), "is missing", "restore the run from a good copy") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(str(path), f"cannot be read ({error})", "restore the run from a good copy") from None
+def _count_attempts(path: Path) -> int:
+    return len(read_lines(path)) if path.exists() else 1

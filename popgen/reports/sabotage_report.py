@@ -19,15 +19,15 @@ Keys of the JSON object (`self_sabotage.json`); a figure is `{"mean": x, "standa
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rich.table import Table
+import pandas as pd
 
-from popgen.reports.paper_figures import METHOD_NAMES, SABOTAGE
+from popgen.reports.frames import UNKNOWN, Sheet, number_text, range_text, spread_of, to_csv
+from popgen.reports.method_titles import name_of, title_of
+from popgen.reports.paper_figures import SABOTAGE
 
 PLAIN, PENALTY = "plain", "penalty"
 TERMINATIONS: dict[str, dict[str, Any]] = {
@@ -42,8 +42,21 @@ TITLES = {
     "": "as trained",
 }
 CSV_FIELDS = (
-    *("source", "method", "name", "termination", "training_seed", "member", "self_sabotage", "ended_early"),
-    *("landmark", "sp", "xp", "sp_plain", "xp_plain", "sp_penalty", "xp_penalty"),
+    "source",
+    "method",
+    "name",
+    "termination",
+    "training_seed",
+    "member",
+    "self_sabotage",
+    "ended_early",
+    "landmark",
+    "sp",
+    "xp",
+    "sp_plain",
+    "xp_plain",
+    "sp_penalty",
+    "xp_penalty",
 )
 """One row a member, then one with member `average`; `source` is popgen or paper. Scores stand on the average's row."""
 
@@ -63,100 +76,102 @@ def build_report(environment: str, episodes: int, seed: int, steps: int, rows: S
         "seed": seed,
         "steps": {"evaluation": steps},
         "rows": [dict(row) for row in rows],
-        "means": _means(rows),
+        "means": _average_populations(rows),
         "paper": {
-            method: {"agents": list(row.agents), "average": row.average, "sp": row.scores.sp, "xp": row.scores.xp}
-            for method, row in SABOTAGE.items()
+            name_of(row.method): {"agents": list(row.ended_early), "average": row.average, "sp": row.sp, "xp": row.xp}
+            for row in SABOTAGE
         },
     }
 
 
-def _means(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["termination"], row["name"], row["method"]), []).append(row)
-    found = []
-    for (termination, name, method), members in groups.items():
-        figures = {"average": [row["average"] for row in members]}
-        figures["average_ended_early"] = [row["average_ended_early"] for row in members]
-        figures |= {score: [row[score]["mean"] for row in members] for score in ("sp", "xp")}
-        found.append(
-            {"method": method, "name": name, "termination": termination, "populations": len(members)}
-            | {key: _spread(values) for key, values in figures.items()}
-        )
-    return found
+def _average_populations(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Of each method and termination."""
+    names = ("average", "average_ended_early", "sp", "xp")
+    heads = ("method", "name", "termination")
+    cells = [{**row, "sp": row["sp"]["mean"], "xp": row["xp"]["mean"]} for row in rows]
+    frame = pd.DataFrame(cells, columns=[*heads, *names])
+    return [
+        dict(zip(heads, key, strict=True))
+        | {"populations": len(part)}
+        | {name: spread_of(part[name]) for name in names}
+        for key, part in frame.groupby([*heads], sort=False)
+    ]
 
 
-def _spread(values: Sequence[float | None]) -> dict[str, float | None]:
-    known = [value for value in values if value is not None]
-    if not known:
-        return {"mean": None, "low": None, "high": None}
-    return {"mean": sum(known) / len(known), "low": min(known), "high": max(known)}
-
-
-def to_csv(report: Mapping[str, Any]) -> str:
+def members_csv(report: Mapping[str, Any]) -> str:
     """The table in long form, with the header CSV_FIELDS."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, CSV_FIELDS, lineterminator="\n", restval="")
-    writer.writeheader()
+    return to_csv([*_list_ours(report), *_list_papers(report)], CSV_FIELDS)
+
+
+def _list_ours(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     for row in report["rows"]:
         head = {"source": "popgen", **{key: row[key] for key in ("method", "name", "termination", "training_seed")}}
         landmarks = row["landmarks"]["members"] if row["landmarks"] else [None] * len(row["members"])
-        for at, member in enumerate(row["members"]):
-            own = {"self_sabotage": row["self_sabotage"][at], "ended_early": row["ended_early"][at]}
-            writer.writerow(head | own | {"member": member, "landmark": _or_empty(landmarks[at])})
+        columns = (row["members"], row["self_sabotage"], row["ended_early"], landmarks)
+        for cells in zip(*columns, strict=True):
+            yield head | dict(zip(("member", "self_sabotage", "ended_early", "landmark"), cells, strict=True))
         total = {"member": "average", "self_sabotage": row["average"], "ended_early": row["average_ended_early"]}
-        total |= {score: _or_empty(row[score]["mean"]) for score in ("sp", "xp")}
+        total |= {score: row[score]["mean"] for score in ("sp", "xp")}
         for rule, figures in row["scored"].items():
-            total |= {f"{score}_{rule}": _or_empty(figures[score]["mean"]) for score in ("sp", "xp")}
-        writer.writerow(head | total)
+            total |= {f"{score}_{rule}": figures[score]["mean"] for score in ("sp", "xp")}
+        yield head | total
+
+
+def _list_papers(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     for method, row in report["paper"].items():
-        head = {"source": "paper", "method": method, "name": METHOD_NAMES[method]}
+        head = {"source": "paper", "method": method, "name": title_of(method)}
         for member, fraction in enumerate(row["agents"], start=1):
-            writer.writerow(head | {"member": member, "ended_early": fraction})
-        writer.writerow(head | {"member": "average", "ended_early": row["average"], "sp": row["sp"], "xp": row["xp"]})
-    return text.getvalue()
+            yield head | {"member": member, "ended_early": fraction}
+        yield head | {"member": "average", "ended_early": row["average"], "sp": row["sp"], "xp": row["xp"]}
 
 
-def _or_empty(value: Any) -> Any:
-    return "" if value is None else value
+def to_sheets(report: Mapping[str, Any]) -> list[Sheet]:
+    """One table for each rule of termination, the paper's rows below ours."""
+    return [_make_sheet(report, rule) for rule in dict.fromkeys(row["termination"] for row in report["rows"])]
 
 
-def _lines(report: Mapping[str, Any], termination: str) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of one termination's table, the paper's rows below ours."""
-    ours = [row for row in report["rows"] if row["termination"] == termination]
-    size = max((len(row["members"]) for row in ours), default=0)
-    size = max(size, max(len(row["agents"]) for row in report["paper"].values()))
-    head = ["", *(str(agent) for agent in range(1, size + 1)), "average", "any exit", "SP", "XP", "landmarks"]
-    lines = []
-    for row in ours:
-        agents = [f"{value:.2f}" for value in row["self_sabotage"]] + [""] * (size - len(row["members"]))
-        used = f"{len(row['landmarks']['used'])} of {row['landmarks']['of']}" if row["landmarks"] else "-"
-        scores = [_score(row["sp"]["mean"]), _xp(row)]
-        label = f"{row['name']}, seed {row['training_seed']}"
-        average, ended = f"{row['average']:.3f}", f"{row['average_ended_early']:.3f}"
-        lines.append([label, *agents, average, ended, *scores, used])
-    for method, row in report["paper"].items():
-        agents = [f"{value:g}" for value in row["agents"]] + [""] * (size - len(row["agents"]))
-        scores = [_score(row["sp"]), _score(row["xp"])]
-        lines.append([f"{METHOD_NAMES[method]}, paper", *agents, *[f"{row['average']:g}"] * 2, *scores, "-"])
-    return head, lines
+def _make_sheet(report: Mapping[str, Any], termination: str) -> Sheet:
+    ours = [_our_cells(row) for row in report["rows"] if row["termination"] == termination]
+    theirs = [_paper_cells(method, row) for method, row in report["paper"].items()]
+    size = max(len(cells["agents"]) for cells in ours + theirs)
+    agents = [cells["agents"] + [""] * (size - len(cells["agents"])) for cells in ours + theirs]
+    frame = pd.DataFrame(ours + theirs).drop(columns="agents")
+    for number in range(size):
+        frame.insert(1 + number, str(number + 1), [cells[number] for cells in agents])
+    title = f"Self-sabotage in {report['environment']}: {TITLES[termination]}"
+    return Sheet(title, frame, dim=frozenset(range(len(ours), len(frame))))
 
 
-def _score(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+def _our_cells(row: Mapping[str, Any]) -> dict[str, Any]:
+    landmarks = row["landmarks"]
+    return {
+        "": f"{row['name']}, seed {row['training_seed']}",
+        "agents": [f"{value:.2f}" for value in row["self_sabotage"]],
+        "average": f"{row['average']:.3f}",
+        "any exit": f"{row['average_ended_early']:.3f}",
+        "SP": number_text(row["sp"]["mean"]),
+        "XP": _cross_play_text(row),
+        "landmarks": f"{len(landmarks['used'])} of {landmarks['of']}" if landmarks else UNKNOWN,
+    }
 
 
-def _xp(row: Mapping[str, Any]) -> str:
+def _paper_cells(method: str, row: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "": f"{title_of(method)}, paper",
+        "agents": [f"{value:g}" for value in row["agents"]],
+        "average": f"{row['average']:g}",
+        "any exit": f"{row['average']:g}",
+        "SP": number_text(row["sp"]),
+        "XP": number_text(row["xp"]),
+        "landmarks": UNKNOWN,
+    }
+
+
+def _cross_play_text(row: Mapping[str, Any]) -> str:
     """Cross-play as it was paid in training and, where exits cost nothing, what it is with the penalty."""
-    paid = _score(row["xp"]["mean"])
+    paid = number_text(row["xp"]["mean"])
     other = row["scored"].get(PENALTY) if row["termination"] == PLAIN else None
-    return paid if other is None else f"{paid} ({_score(other['xp']['mean'])})"
-
-
-def terminations(report: Mapping[str, Any]) -> list[str]:
-    """The rules that the rows were trained by, in order."""
-    return list(dict.fromkeys(row["termination"] for row in report["rows"]))
+    return paid if other is None else f"{paid} ({number_text(other['xp']['mean'])})"
 
 
 NOTES = (
@@ -167,32 +182,10 @@ NOTES = (
 )
 
 
-def to_tables(report: Mapping[str, Any]) -> list[Table]:
-    """One table for the terminal for each rule of termination."""
-    tables = []
-    for termination in terminations(report):
-        head, lines = _lines(report, termination)
-        table = Table(title=f"self-sabotage in {report['environment']}: {TITLES[termination]}")
-        table.add_column(head[0], style="bold", no_wrap=True)
-        for label in head[1:]:
-            table.add_column(label, justify="right")
-        for line in lines:
-            table.add_row(*line, style="dim" if line[0].endswith("paper") else None)
-        tables.append(table)
-    return tables
-
-
 def to_markdown(report: Mapping[str, Any]) -> str:
     """All tables with what their columns mean."""
-    parts = []
-    for termination in terminations(report):
-        head, lines = _lines(report, termination)
-        parts += [f"Self-sabotage in {report['environment']}: {TITLES[termination]}.", ""]
-        parts += ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-        parts += ["| " + " | ".join(line) + " |" for line in lines] + [""]
-    parts += [f"- {note}" for note in NOTES]
-    parts += [f"- {line}" for line in summary(report)]
-    return "\n".join(parts) + "\n"
+    parts = [f"{sheet.title}.\n\n{sheet.to_markdown()}\n\n" for sheet in to_sheets(report)]
+    return "".join([*parts, *(f"- {line}\n" for line in (*NOTES, *summary(report)))])
 
 
 def summary(report: Mapping[str, Any]) -> list[str]:
@@ -200,17 +193,14 @@ def summary(report: Mapping[str, Any]) -> list[str]:
     lines = []
     for row in report["means"]:
         if row["populations"] > 1:
-            parts = (f"{name} {_range(row[key])}" for name, key in (("average", "average"), ("SP", "sp"), ("XP", "xp")))
+            parts = (
+                f"{name} {range_text(row[key], 3)}"
+                for name, key in (("average", "average"), ("SP", "sp"), ("XP", "xp"))
+            )
             of = f"{row['name']} ({row['termination'] or 'as trained'}), {row['populations']} populations"
             lines.append(f"{of}: {', '.join(parts)}")
     lines.append(f"{report['episodes']} episodes per pair, {report['steps']['evaluation']:,} environment steps")
     return lines
-
-
-def _range(spread: Mapping[str, float | None]) -> str:
-    if spread["mean"] is None:
-        return "-"
-    return f"{spread['mean']:.3f} ({spread['low']:.3f} to {spread['high']:.3f})"
 
 
 def to_json(report: Mapping[str, Any]) -> str:

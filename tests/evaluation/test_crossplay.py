@@ -49,7 +49,7 @@ def test_below_needs_two_standard_errors_of_the_difference() -> None:
 
 def test_rows_are_seat_0_and_columns_seat_1() -> None:
     got = evaluate_population(Cast(Script([ONE]), Script([TWO, STAY])), 4, 0)  # type: ignore[arg-type]
-    mean, error = got.table(got.labels)
+    mean, error = got.to_frame("mean"), got.to_frame("error")
     # Per episode both give 6 points in seat 0 and 60 in seat 1: `two` is worth double but played half as often.
     np.testing.assert_array_equal(mean, [[66, 66], [66, 66]])
     np.testing.assert_array_equal(error, 0)
@@ -62,10 +62,17 @@ def test_rows_are_seat_0_and_columns_seat_1() -> None:
     assert len(got.pairings) == 2 * 2 + 2 * 2 * 2 and got.steps == 12 * 4 * HORIZON
 
 
+def test_the_frame_names_its_seats_and_can_hold_the_partners() -> None:
+    got = evaluate_population(Cast(Script([ONE]), Script([TWO, STAY])), 4, 0)  # type: ignore[arg-type]
+    frame = got.to_frame(labels=(2, "idle"))
+    assert (frame.index.name, frame.columns.name) == ("seat_0", "seat_1")
+    assert frame.loc["2", "2"] == 66 and frame.loc["2", "idle"] == 6 and math.isnan(frame.loc["idle", "idle"])
+
+
 def test_unequal_seats_and_means() -> None:
     asymmetric = Script([ONE], [STAY])
     got = evaluate_population(Cast(asymmetric, Script([TWO])), 2, 0)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(got.table(got.labels)[0], [[6, 126], [12, 132]])
+    np.testing.assert_array_equal(got.to_frame(), [[6, 126], [12, 132]])
     assert got.sp.mean == (6 + 132) / 2 and got.xp.mean == (126 + 12) / 2
 
 

@@ -18,7 +18,8 @@ from popgen.envs.rendezvous import worst_reward
 from popgen.errors import UserError
 from popgen.evaluation.sabotage import SabotageResult, leave_event, measure_sabotage, to_dict
 from popgen.population.manifest import EnvironmentInfo
-from popgen.reports import plots, sabotage_report
+from popgen.reports import sabotage_report
+from popgen.reports.charts.path_charts import PathSample, path_grid, path_samples
 from popgen.reports.paper_figures import SABOTAGE
 from popgen.reports.sabotage_report import PENALTY, PLAIN, TERMINATIONS, build_report
 
@@ -196,7 +197,7 @@ def test_json_holds_the_documented_keys(report: dict[str, Any]) -> None:
 
 
 def test_csv_has_a_row_a_member_and_the_papers(report: dict[str, Any]) -> None:
-    rows = list(csv.DictReader(io.StringIO(sabotage_report.to_csv(report))))
+    rows = list(csv.DictReader(io.StringIO(sabotage_report.members_csv(report))))
     assert tuple(rows[0]) == sabotage_report.CSV_FIELDS and len(rows) == 4 + 4 + 2 + 3 * 9
     assert (rows[2]["member"], rows[2]["self_sabotage"], rows[2]["ended_early"]) == ("3", "0.25", "0.75")
     assert rows[3]["member"] == "average" and rows[7]["xp_penalty"] == "-99.0"
@@ -205,22 +206,22 @@ def test_csv_has_a_row_a_member_and_the_papers(report: dict[str, Any]) -> None:
 
 
 def test_tables_stand_beside_the_papers_for_each_rule(report: dict[str, Any], trio: SabotageResult) -> None:
-    text = sabotage_report.to_markdown(report)
+    text = re.sub(" +", " ", sabotage_report.to_markdown(report))
     assert (
         text.count("| CoMeDi, paper | 0 | 0 | 0 | 0 | 0 | 0 | 0.175 | 0.57 | 0.09 | 0.09 | 30.67 | -114.01 | - |") == 2
     )
-    assert "| LIPO, seed 1 | 0.00 | 1.00 | 0.25 |  |  |  |  |  | 0.417 | 0.583 |" in text
+    assert "| LIPO, seed 1 | 0.00 | 1.00 | 0.25 | | | | | | 0.417 | 0.583 |" in text
     assert f"{trio.xp.mean:.2f} (-99.00)" in text  # exits cost nothing there: what they would with the penalty
     assert "costs nothing" in text and "2 populations: average 0.208 (0.000 to 0.417)" in text
-    assert [len(table.rows) for table in sabotage_report.to_tables(report)] == [2 + 3, 1 + 3]
+    assert [len(sheet.to_rich().rows) for sheet in sabotage_report.to_sheets(report)] == [2 + 3, 1 + 3]
     assert len(SABOTAGE) == 3
 
 
 def test_paths_are_drawn(trio: SabotageResult, tmp_path: Path) -> None:
     assert trio.paths is not None
     grid, sample = [tmp_path / "grid.png", tmp_path / "grid.svg"], [tmp_path / "one.png", tmp_path / "one.svg"]
-    plots.path_grid(trio.paths, grid, title="three members")
-    plots.path_samples([("LIPO", trio.paths, (2, 1))], sample)
+    path_grid(trio.paths, grid, title="three members")
+    path_samples([PathSample("LIPO", trio.paths, (2, 1))], sample)
     for files in (grid, sample):
         assert imread(files[0]).std() > 0.02
         assert "left bounds" in files[1].read_text() and "seat 1" in files[1].read_text()

@@ -13,8 +13,9 @@ from matplotlib.image import imread
 from support.finished import CRAMPED, finished_run
 
 from popgen.errors import UserError
-from popgen.reports import comparison_report, plots
+from popgen.reports import comparison_report
 from popgen.reports import paper_figures as paper
+from popgen.reports.charts.scaling_charts import choose_looks
 from popgen.reports.comparison import (
     CONSTANT,
     LINE,
@@ -32,7 +33,9 @@ from popgen.reports.comparison import (
     time_band,
 )
 from popgen.reports.comparison_report import Comparison, chosen_thresholds
-from popgen.reports.run_record import Point, RunRecord, read_curves, read_run
+from popgen.reports.method_titles import METHODS
+from popgen.reports.run_record import RunRecord, read_run
+from popgen.reports.training_curves import Point, read_curves
 
 RING = "overcooked/coordination_ring"
 
@@ -263,13 +266,13 @@ def test_runs_of_one_label_must_be_seeds_of_one_thing(tmp_path: Path, model: Run
 
 def test_budgets_of_the_baselines_under_both_readings() -> None:
     # Eight agents: 8 budgets of self-play; 28 pairs, or 7 agents that have a partner.
-    assert paper.baseline_budget("lipo", 8, paper.PER_PREDECESSOR, 10) == {"SP": 80, "XP": 280}
-    assert paper.baseline_budget("comedi", 8, paper.PER_PREDECESSOR, 10) == {"SP": 80, "XP": 280, "MP": 280}
-    assert paper.baseline_budget("comedi", 8, paper.PER_AGENT, 10) == {"SP": 80, "XP": 70, "MP": 70}
+    assert paper.baseline_budget("LIPO", 8, paper.PER_PREDECESSOR, 10) == {"SP": 80, "XP": 280}
+    assert paper.baseline_budget("CoMeDi", 8, paper.PER_PREDECESSOR, 10) == {"SP": 80, "XP": 280, "MP": 280}
+    assert paper.baseline_budget("CoMeDi", 8, paper.PER_AGENT, 10) == {"SP": 80, "XP": 70, "MP": 70}
     assert paper.xpm_wm_budget(CRAMPED, 8) == 34_000_000 and paper.xpm_wm_budget("overcooked/mine", 8) is None
     ratios = {
         reading: [
-            sum(paper.baseline_budget("comedi", 8, reading).values()) / paper.xpm_wm_budget(layout, 8)  # type: ignore[operator]
+            sum(paper.baseline_budget("CoMeDi", 8, reading).values()) / paper.xpm_wm_budget(layout, 8)  # type: ignore[operator]
             for layout in paper.XPM_WM_STEPS
         ]
         for reading in paper.READINGS
@@ -289,9 +292,10 @@ def test_budgets_are_printed_for_the_paper_and_for_our_own_runs(tmp_path: Path, 
 
 
 def test_the_papers_averages_are_those_of_its_agents() -> None:
-    for row in paper.SABOTAGE.values():
-        assert np.mean(row.agents) == pytest.approx(row.average, abs=0.006)
-    mean = np.mean([scores["xpm_wm"].sp for name, scores in paper.SCORES.items() if name.startswith("overcooked")])
+    for row in paper.SABOTAGE:
+        assert np.mean(row.ended_early) == pytest.approx(row.average, abs=0.006)
+    own = [row for row in paper.REPORTED if row.method == paper.OWN_METHOD]
+    mean = np.mean([row.sp for row in own if row.environment.startswith("overcooked")])
     assert mean == pytest.approx(12.36, abs=0.005)
 
 
@@ -342,12 +346,14 @@ def test_csv_marks_what_was_extrapolated(comparison: Comparison) -> None:
 
 
 def test_markdown_names_every_method_the_papers_rows_and_the_marks(comparison: Comparison) -> None:
-    text = comparison_report.to_markdown(comparison_report.to_dict(comparison))
+    text = re.sub(" +", " ", comparison_report.to_markdown(comparison_report.to_dict(comparison)))
     assert "| overcooked/cramped_room | XPM-WM | 2 | 9.50 (9.00 to 10.00) |" in text
     assert "| overcooked/cramped_room | LIPO | 0 | - | - | - | - | - | 8.99 | 2.40 |" in text
     assert "8* |" in text and "> 930" in text and "XPM-Sim" in text
     assert "Simulated steps" in text and "extrapolated" in text
-    assert all(len(table.columns) for table in comparison_report.to_tables(comparison_report.to_dict(comparison)))
+    assert all(
+        len(sheet.to_rich().columns) for sheet in comparison_report.to_sheets(comparison_report.to_dict(comparison))
+    )
 
 
 def test_charts_are_written_and_told_apart_without_colour(comparison: Comparison, tmp_path: Path) -> None:
@@ -368,12 +374,12 @@ def test_charts_are_written_and_told_apart_without_colour(comparison: Comparison
     assert (again / "steps.svg").read_text() == svg
 
 
-def test_styles_keep_a_methods_colour_and_give_others_what_is_left() -> None:
-    styles = plots.method_styles(["xpm_wm", "mine", "lipo", "yours"])
-    assert styles["xpm_wm"][0] == plots.METHOD_COLOURS["xpm_wm"]
-    assert len({colour for colour, _ in styles.values()}) == 4 == len({marker for _, marker in styles.values()})
-    assert set(plots.METHOD_COLOURS) == set(plots.METHOD_MARKERS) == set(paper.METHOD_NAMES)
-    assert len(set(plots.METHOD_COLOURS.values())) == len(plots.METHOD_COLOURS)
+def test_looks_keep_a_methods_colour_and_give_others_what_is_left() -> None:
+    looks = choose_looks(["xpm_wm", "mine", "lipo", "yours"])
+    assert looks["xpm_wm"].colour == METHODS["xpm_wm"].colour
+    assert len({look.colour for look in looks.values()}) == 4 == len({look.marker for look in looks.values()})
+    assert len({method.colour for method in METHODS.values()}) == len(METHODS)
+    assert {row.method for row in paper.REPORTED} <= {method.title for method in METHODS.values()}
 
 
 def test_a_band_leaves_out_points_that_a_seed_does_not_have() -> None:

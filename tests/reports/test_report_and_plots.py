@@ -6,7 +6,7 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.image import imread
 from rich.console import Console
@@ -15,7 +15,23 @@ from support.scripted import HORIZON, ONE, STAY, TWO, Cast, Script
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import CrossPlayResult, evaluate_population
 from popgen.reports import crossplay_report as report
-from popgen.reports import plots
+from popgen.reports.charts.curve_charts import learning_curves, score_limits, steps_by_members
+from popgen.reports.frames import (
+    Sheet,
+    estimate_text,
+    number_text,
+    range_text,
+    seeds_text,
+    spread_of,
+    steps_text,
+    to_csv,
+)
+from popgen.reports.training_curves import Point
+
+
+def squeezed(text: str) -> str:
+    """Without the blanks that align a Markdown table."""
+    return re.sub(" +", " ", text)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +68,7 @@ def test_json_has_null_where_nothing_is_known(alone: CrossPlayResult) -> None:
 
 
 def test_csv_is_one_figure_a_row(result: CrossPlayResult) -> None:
-    rows = list(csv.DictReader(io.StringIO(report.to_csv(result))))
+    rows = list(csv.DictReader(io.StringIO(report.figures_csv(result))))
     assert tuple(rows[0]) == report.CSV_FIELDS and len(rows) == 12 * (3 + 2 * 2)
     found = {(row["seat_0"], row["seat_1"], row["figure"], row["seat"]): row for row in rows}
     assert len(found) == len(rows)
@@ -63,32 +79,51 @@ def test_csv_is_one_figure_a_row(result: CrossPlayResult) -> None:
 
 
 def test_markdown_and_terminal_show_the_matrix(result: CrossPlayResult, alone: CrossPlayResult) -> None:
-    text = report.to_markdown(result)
-    assert "| 1 | 6.00 ± 0.00 | 126.00 ± 0.00 |" in text and "SP mean 69.00 ± 0.00 points" in text
-    assert "XP mean -" in report.to_markdown(alone)
+    text = report.to_markdown(report.to_dict(result))
+    assert "| 1 | 6.00 ± 0.00 | 126.00 ± 0.00 |" in squeezed(text) and "SP mean 69.00 ± 0.00 points" in text
+    assert "XP mean -" in report.to_markdown(report.to_dict(alone))
     out = io.StringIO()
-    Console(file=out, width=80).print(report.to_rich(result))
+    Console(file=out, width=80).print(report.matrix_sheet(report.to_dict(result), narrow=True).to_rich())
     assert "126.00" in out.getvalue() and max(map(len, out.getvalue().splitlines())) <= 80
 
 
 def test_table_and_summary_can_be_made_of_the_json_alone(result: CrossPlayResult, alone: CrossPlayResult) -> None:
     for each in (result, alone):
-        told = json.loads(report.to_json(each))
-        assert report.summary_lines(told) == report.summary(each)
-        texts = []
-        for table in (report.matrix_table(told), report.to_rich(each)):
+        text = json.loads(report.to_json(each))
+        assert report.summary(text) == report.summary(report.to_dict(each))
+        tables = []
+        for table in (report.matrix_sheet(text).to_rich(), report.matrix_sheet(report.to_dict(each)).to_rich()):
             out = io.StringIO()
             Console(file=out, width=80).print(table)
-            texts.append(out.getvalue())
-        assert texts[0] == texts[1] and "idle" in texts[0]
-    assert report.figure_text({"mean": 1.25, "standard_error": None}, digits=1) == "1.2"
-    assert report.figure_text({"mean": None, "standard_error": None}) == "-"
+            tables.append(out.getvalue())
+        assert tables[0] == tables[1] and "idle" in tables[0]
+
+
+def test_figures_as_text() -> None:
+    assert estimate_text({"mean": 1.25, "standard_error": None}, digits=1) == "1.2"
+    assert estimate_text({"mean": None, "standard_error": None}) == "-" == number_text(None)
+    assert estimate_text({"mean": 1.0, "standard_error": 0.5}) == "1.00 ± 0.50"
+    assert spread_of([1.0, None, 4.0]) == {"mean": 2.5, "low": 1.0, "high": 4.0}
+    assert spread_of([None]) == {"mean": None, "low": None, "high": None}
+    assert range_text(spread_of([1.0, None, 4.0])) == "2.50 (1.00 to 4.00)"
+    assert range_text(spread_of([2.0, 2.0]), 3) == "2.000" and range_text(spread_of([])) == "-"
+    assert seeds_text([3]) == "seed 3" and seeds_text([1, 2]) == "seeds 1, 2"
+
+
+def test_tables_keep_types_and_take_labels_as_they_are() -> None:
+    text = to_csv([{"a": 1, "b": None, "c": 0.1}, {"a": 2, "b": 3}], ("b", "a", "c"))
+    assert text == "b,a,c\n,1,0.1\n3,2,\n"
+    sheet = Sheet("[bold]title", pd.DataFrame([{"name": "[red]x", "score": "1.50"}]))
+    assert sheet.to_markdown().splitlines()[0] == "| name   |   score |"
+    out = io.StringIO()
+    Console(file=out, width=80).print(sheet.to_rich())
+    assert "[red]x" in out.getvalue() and "[bold]title" in out.getvalue()
 
 
 def test_summary_names_obstruction() -> None:
     helpful, blocking = Script([TWO]), Script([STAY])
     got = evaluate_population(Cast(helpful, blocking), 20, 0)  # type: ignore[arg-type]
-    lines = report.summary(got)
+    lines = report.summary(report.to_dict(got))
     # Seat 1 counts ten times: with `blocking` there, member 1 does worse than beside a random partner.
     assert "pairs (seat 0-seat 1) worse than a random or idle partner: 1-2" in lines, lines
     assert {(found.pair, found.partner, found.member) for found in got.obstructions} == {((1, 2), "random", 1)}
@@ -101,7 +136,15 @@ def test_report_files(result: CrossPlayResult, alone: CrossPlayResult, tmp_path:
     image = imread(paths["png"])
     assert image.shape[1] >= 900 and image.std() > 0.05
     drawn = paths["svg"].read_text()
-    for part in ("126", "player in seat 0", "player in seat 1", "points", "random", "idle", "tally/hand"):
+    for part in (
+        "126",
+        "player in seat 0",
+        "player in seat 1",
+        "points",
+        "random",
+        "idle",
+        "tally/hand, by_hand, seed 0",
+    ):
         assert part in drawn, part
     again = report.write_report(result, tmp_path / "again")
     for suffix, path in paths.items():
@@ -115,20 +158,32 @@ def test_a_folder_that_cannot_be_written(result: CrossPlayResult, tmp_path: Path
         report.write_report(result, tmp_path / "file")
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 9])
-def test_line_charts(tmp_path: Path, count: int) -> None:
-    x = np.linspace(0, 6e5, 5)
-    plots.learning_curves(
-        {f"member {n}": (x, n * x) for n in range(count)}, [tmp_path / "a.svg"], unit="points", title="T"
-    )
-    drawn = (tmp_path / "a.svg").read_text()
-    assert "points" in drawn and "environment steps" in drawn and drawn.count("member ") == count
-    totals = {f"run {n}": [(n + 1) * 1e5, (n + 1) * 3e5] for n in range(count)}
-    plots.steps_by_members(totals, [tmp_path / "b.svg", tmp_path / "b.png"])
-    assert "environment steps in all" in (tmp_path / "b.svg").read_text() and imread(tmp_path / "b.png").size
-    plots.steps_by_members(totals, [tmp_path / "c.svg"], log=True)
-    assert "members" in (tmp_path / "c.svg").read_text()
+@pytest.mark.parametrize("count", [0, 1, 3, 8, 9])
+def test_learning_curves_have_a_colour_a_member_and_a_dash_a_score(tmp_path: Path, count: int) -> None:
+    curves = {
+        member: [Point(100_000 * n, float(member * n), None if member == 1 else n / 2) for n in range(5)]
+        for member in range(1, count + 1)
+    }
+    files = [tmp_path / "a.svg", tmp_path / "a.png"]
+    learning_curves(curves, files, unit="points", title="T", limits=score_limits(curves))
+    drawn = files[0].read_text()
+    assert "points" in drawn and "real environment steps of the member" in drawn and drawn.count(">member ") == count
+    assert ("strongest XP" in drawn) == (count > 1) and imread(files[1]).size
+    texts = re.findall(r"translate\(([\d.]+) [\d.]+\)[^>]*>member", drawn)
+    assert all(float(x) < 3.4 * 72 - 25 for x in texts)  # no entry of the legend is cut at the right
+
+
+def test_scores_of_several_figures_have_one_scale() -> None:
+    curves = {1: [Point(0, 4.0, None)], 2: [Point(0, 1.0, -2.0)]}
+    assert score_limits(curves) == (-2.3, 4.3) and score_limits({}) is None
+    assert score_limits({1: [Point(0, 10.0, None)]}) == (0.0, 10.5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 8])
+def test_steps_by_members(tmp_path: Path, count: int) -> None:
+    steps_by_members([(n + 1) * 1e5 for n in range(count)], [tmp_path / "b.svg", tmp_path / "b.png"], title="T")
+    assert "real environment steps in all" in (tmp_path / "b.svg").read_text() and imread(tmp_path / "b.png").size
 
 
 def test_steps_are_told_in_thousands_and_millions() -> None:
-    assert [plots._thousands(value) for value in (0, 500, 25_000, 1.5e6, 2e9)] == ["0", "500", "25k", "1.5M", "2G"]
+    assert [steps_text(value) for value in (0, 500, 25_000, 1.5e6, 2e9)] == ["0", "500", "25k", "1.5M", "2G"]

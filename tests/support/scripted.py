@@ -118,7 +118,7 @@ class Cast:
 
     def __init__(self, *members: Script) -> None:
         self._members, self.spec, self.env_info = members, TallyEnv.spec, EnvironmentInfo.of(TallyEnv.spec)
-        self.manifest = type("Manifest", (), {"method": "by_hand"})()
+        self.manifest = type("Manifest", (), {"method": "by_hand", "seed": 0})()
 
     def __len__(self) -> int:
         return len(self._members)

@@ -19,7 +19,7 @@ Keys of the JSON object (`comparison.json`); null stands for what is unknown:
                              agents, reading, budget, steps (by kind), total, ratio (over the paper's XPM-WM)
     notes                    what a reader must know, in sentences
 
-`contents` makes that object, `tables` its CSV files and tables, `figures` the charts.
+`comparison_contents` makes that object, `comparison_tables` its CSV files and tables, `comparison_charts` the charts.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ import json
 from pathlib import Path
 
 from popgen.errors import UserError
-from popgen.reports.comparison_report.charts import draw
-from popgen.reports.comparison_report.contents import Comparison, chosen_thresholds, to_dict
-from popgen.reports.comparison_report.tables import (
+from popgen.reports.comparison_report.comparison_charts import draw_comparison
+from popgen.reports.comparison_report.comparison_contents import Comparison, chosen_thresholds, to_dict
+from popgen.reports.comparison_report.comparison_tables import (
     BUDGET_FIELDS,
     COST_FIELDS,
     QUALITY_FIELDS,
@@ -38,7 +38,7 @@ from popgen.reports.comparison_report.tables import (
     costs_csv,
     quality_csv,
     to_markdown,
-    to_tables,
+    to_sheets,
 )
 
 __all__ = [
@@ -49,11 +49,11 @@ __all__ = [
     "budgets_csv",
     "chosen_thresholds",
     "costs_csv",
-    "draw",
+    "draw_comparison",
     "quality_csv",
     "to_dict",
     "to_markdown",
-    "to_tables",
+    "to_sheets",
     "write_report",
 ]
 
@@ -76,6 +76,6 @@ def write_report(comparison: Comparison, folder: str | Path) -> dict[str, Path]:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8")
-        return {name: folder / name for name in texts} | draw(comparison, folder)
+        return {name: folder / name for name in texts} | draw_comparison(comparison, folder)
     except OSError as error:
         raise UserError(str(folder), f"cannot be written: {error.strerror}", "choose another folder") from error

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import pandas as pd
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 
 from popgen.population.manifest import folder_name
 from popgen.population.store import Population
+from popgen.reports.frames import Sheet
 from popgen.types import Kind
 
 
-def describe(population: Population) -> dict[str, Any]:
+def describe_population(population: Population) -> dict[str, Any]:
     """A JSON-able account of a population.
 
     Keys: `path`; `manifest`, as in the file; `bytes`, size of all members' files; `steps`, environment steps by kind,
@@ -20,7 +24,7 @@ def describe(population: Population) -> dict[str, Any]:
     (of its folder) and `parameters` (numbers in policy.safetensors).
     """
     members = [_describe_member(population, member) for member in range(1, len(population) + 1)]
-    kinds = step_kinds(population)
+    kinds = list_kinds(population)
     return {
         "path": str(population.path),
         "manifest": population.manifest.model_dump(mode="json"),
@@ -42,38 +46,45 @@ def _describe_member(population: Population, member: int) -> dict[str, Any]:
     }
 
 
-def step_kinds(population: Population) -> list[str]:
+def list_kinds(population: Population) -> list[str]:
     """Kinds of environment steps that some member used, in the order of `Kind`."""
     used = {kind for info in population.members for kind in info.steps}
     return [str(kind) for kind in Kind if str(kind) in used]
 
 
-def render(population: Population) -> Group:
+def render_population(population: Population) -> Group:
     """The account as text for the terminal; print it with a rich console."""
-    told = describe(population)
+    report = describe_population(population)
     info, manifest = population.env_info, population.manifest
-    facts = Table.grid(padding=(0, 2))
     params = ", ".join(f"{name}={value}" for name, value in info.params.items() if name != "grid")
-    for name, value in (
-        ("population", told["path"]),
-        ("environment", f"{info.name} ({params})" if params else info.name),
-        ("rules", info.fingerprint[:12]),
-        ("method", f"{manifest.method}, seed {manifest.seed}, config {manifest.config_digest[:12]}"),
-        ("members", f"{len(population)}, {told['bytes'] / 2**20:.1f} MiB, {told['total_steps']:,} environment steps"),
-        ("written by", ", ".join(f"{name} {value}" for name, value in manifest.versions.model_dump().items())),
-    ):
-        facts.add_row(name, value)
-    return Group(facts, "", _members_table(told, step_kinds(population)))
+    size, steps = report["bytes"] / 2**20, report["total_steps"]
+    facts = {
+        "population": report["path"],
+        "environment": f"{info.name} ({params})" if params else info.name,
+        "rules": info.fingerprint[:12],
+        "method": f"{manifest.method}, seed {manifest.seed}, config {manifest.config_digest[:12]}",
+        "members": f"{len(population)}, {size:.1f} MiB, {steps:,} environment steps",
+        "written by": ", ".join(f"{name} {value}" for name, value in manifest.versions.model_dump().items()),
+    }
+    grid = Table.grid(padding=(0, 2))
+    for name, value in facts.items():
+        grid.add_row(name, escape(value))
+    return Group(grid, "", _members_sheet(report).to_rich())
 
 
-def _members_table(told: dict[str, Any], kinds: list[str]) -> Table:
-    table = Table("member", "policy")
-    for name in ("seed", "parameters", "MiB", *(f"{kind} steps" for kind in kinds), "all steps"):
-        table.add_column(name, justify="right")
-    for member in told["members"]:
-        steps = [f"{member['steps'].get(kind, 0):,}" for kind in kinds]
-        size = (f"{member['parameters']:,}", f"{member['bytes'] / 2**20:.1f}")
-        table.add_row(
-            str(member["id"]), member["kind"], str(member["seed"]), *size, *steps, f"{member['total_steps']:,}"
-        )
-    return table
+def _members_sheet(report: Mapping[str, Any]) -> Sheet:
+    frame = pd.DataFrame(
+        [
+            {
+                "member": str(member["id"]),
+                "policy": member["kind"],
+                "seed": str(member["seed"]),
+                "parameters": f"{member['parameters']:,}",
+                "MiB": f"{member['bytes'] / 2**20:.1f}",
+                **{f"{kind} steps": f"{member['steps'].get(kind, 0):,}" for kind in report["steps"]},
+                "all steps": f"{member['total_steps']:,}",
+            }
+            for member in report["members"]
+        ]
+    )
+    return Sheet("", frame, labels=2)

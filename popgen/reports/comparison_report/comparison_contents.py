@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
 from popgen.errors import UserError
 from popgen.reports import paper_figures as paper
 from popgen.reports.comparison import (
@@ -21,6 +19,8 @@ from popgen.reports.comparison import (
     quality,
     quality_costs,
 )
+from popgen.reports.frames import spread_of
+from popgen.reports.method_titles import name_of, title_of
 from popgen.reports.run_record import REAL, RunRecord
 from popgen.types import Kind
 
@@ -71,20 +71,20 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
         "format": "popgen-comparison",
         "format_version": 1,
         "agents": comparison.agents,
-        "runs": [_run(group, run) for group in comparison.groups for run in group.runs],
-        "costs": [row for group in comparison.groups for row in _costs(group, comparison.agents)],
-        "scores": [_scores(group) for group in comparison.groups],
-        "quality": _quality(comparison),
+        "runs": [_describe_run(group, run) for group in comparison.groups for run in group.runs],
+        "costs": [row for group in comparison.groups for row in _list_costs(group, comparison.agents)],
+        "scores": [_average_scores(group) for group in comparison.groups],
+        "quality": _describe_quality(comparison),
         "paper": {
-            name: {method: {"sp": row.sp, "xp": row.xp} for method, row in paper.SCORES.get(name, {}).items()}
+            name: {name_of(r.method): {"sp": r.sp, "xp": r.xp} for r in paper.REPORTED if r.environment == name}
             for name in comparison.environments
         },
-        "budgets": [_budget(budget) for budget in budgets(comparison.groups, comparison.agents)],
-        "notes": _notes(comparison),
+        "budgets": [_describe_budget(budget) for budget in budgets(comparison.groups, comparison.agents)],
+        "notes": _write_notes(comparison),
     }
 
 
-def _run(group: Group, run: RunRecord) -> dict[str, Any]:
+def _describe_run(group: Group, run: RunRecord) -> dict[str, Any]:
     steps = {kind: sum(m.steps.get(kind, 0) for m in run.members) for kind in KINDS}
     times = [m.seconds for m in run.members]
     return {
@@ -108,7 +108,7 @@ def _run(group: Group, run: RunRecord) -> dict[str, Any]:
     }
 
 
-def _costs(group: Group, agents: int) -> Iterable[dict[str, Any]]:
+def _list_costs(group: Group, agents: int) -> Iterable[dict[str, Any]]:
     for run in group.runs:
         for cost in costs(run, agents):
             yield {
@@ -127,11 +127,11 @@ def _costs(group: Group, agents: int) -> Iterable[dict[str, Any]]:
             }
 
 
-def _scores(group: Group) -> dict[str, Any]:
+def _average_scores(group: Group) -> dict[str, Any]:
     """Means over seeds of each run's own SP/XP report."""
     reports = [run.scores for run in group.runs]
-    sp, xp = (_spread([report[name]["mean"] for report in reports]) for name in ("sp", "xp"))
-    theirs = paper.scores(group.environment, group.method)
+    sp, xp = (spread_of([report[name]["mean"] for report in reports]) for name in ("sp", "xp"))
+    theirs = paper.find_row(group.environment, title_of(group.method))
     apart = None if sp["mean"] is None or xp["mean"] is None else sp["mean"] - xp["mean"]
     return {
         "label": group.label,
@@ -143,20 +143,13 @@ def _scores(group: Group) -> dict[str, Any]:
         "xp": xp,
         "gap": apart,
         "beside": {
-            who: _spread([report["beside"][who]["both"]["mean"] for report in reports]) for who in ("random", "idle")
+            who: spread_of([report["beside"][who]["both"]["mean"] for report in reports]) for who in ("random", "idle")
         },
         "paper": None if theirs is None else {"sp": theirs.sp, "xp": theirs.xp},
     }
 
 
-def _spread(values: Sequence[float | None]) -> dict[str, float | None]:
-    known = [value for value in values if value is not None]
-    if not known:
-        return {"mean": None, "low": None, "high": None}
-    return {"mean": float(np.mean(known)), "low": min(known), "high": max(known)}
-
-
-def _quality(comparison: Comparison) -> dict[str, Any]:
+def _describe_quality(comparison: Comparison) -> dict[str, Any]:
     members, agents = [], []
     for group in comparison.groups:
         limits = comparison.thresholds.get(group.environment)
@@ -167,16 +160,16 @@ def _quality(comparison: Comparison) -> dict[str, Any]:
             for many in quality_costs(run, limits):
                 agents.append(head | asdict(many) | {"lower_bound": many.bound})
     limits = {name: comparison.thresholds.get(name) for name in comparison.environments}
-    told = {name: None if limit is None else {"sp": limit.sp, "xp": limit.xp} for name, limit in limits.items()}
-    return {"thresholds": told, "members": members, "agents": agents}
+    thresholds = {name: None if limit is None else {"sp": limit.sp, "xp": limit.xp} for name, limit in limits.items()}
+    return {"thresholds": thresholds, "members": members, "agents": agents}
 
 
-def _budget(budget: Budget) -> dict[str, Any]:
+def _describe_budget(budget: Budget) -> dict[str, Any]:
     names = ("source", "method", "environment", "agents", "reading", "budget", "total", "ratio")
     return {name: getattr(budget, name) for name in names} | {"steps": dict(budget.steps)}
 
 
-def _notes(comparison: Comparison) -> list[str]:
+def _write_notes(comparison: Comparison) -> list[str]:
     """Sentences about what the figures do not say by themselves."""
     notes = ["Simulated steps (of an exact simulator used as dynamics model) are counted apart and in no total."]
     runs = [run for group in comparison.groups for run in group.runs]

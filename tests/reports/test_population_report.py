@@ -11,7 +11,7 @@ from popgen.envs import make_env
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.population import PopulationWriter, load_population
-from popgen.population.show import describe, render
+from popgen.reports.population_report import describe_population, render_population
 
 
 def make(path: Path) -> Path:
@@ -24,21 +24,21 @@ def make(path: Path) -> Path:
 
 
 def test_describe_adds_up(tmp_path: Path) -> None:
-    told = describe(load_population(make(tmp_path)))
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
-    assert told["steps"] == {"random": 200, "SP": 1_010, "XP": 4} and told["total_steps"] == 1_214
-    assert list(told["steps"]) == ["random", "SP", "XP"]
-    first, second = told["members"]
+    report = describe_population(load_population(make(tmp_path)))
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+    assert report["steps"] == {"random": 200, "SP": 1_010, "XP": 4} and report["total_steps"] == 1_214
+    assert list(report["steps"]) == ["random", "SP", "XP"]
+    first, second = report["members"]
     assert first["parameters"] == (25 + 2) * 8 + 8 + 8 * 5 + 5 and second["parameters"] == 0
     assert first["total_steps"] == 1_200 and first["kind"] == "feed_forward" and second["kind"] == "random"
     on_disk = sum(path.stat().st_size for path in tmp_path.rglob("member_*/*"))
-    assert first["bytes"] + second["bytes"] == told["bytes"] == on_disk
-    assert told["manifest"]["method"] == "xpm_wm" and told["path"] == str(tmp_path)
+    assert first["bytes"] + second["bytes"] == report["bytes"] == on_disk
+    assert report["manifest"]["method"] == "xpm_wm" and report["path"] == str(tmp_path)
 
 
 def test_render_says_what_is_there(tmp_path: Path) -> None:
     text = io.StringIO()
-    Console(file=text, width=120).print(render(load_population(make(tmp_path))))
+    Console(file=text, width=120).print(render_population(load_population(make(tmp_path))))
     for part in ("rendezvous/mppmr", "xpm_wm, seed 3, config abcdef012345", "1,214 environment steps", "feed_forward",
                  "1,200", "SP steps", "XP steps", "random steps", "popgen 0."):  # fmt: skip
         assert part in text.getvalue(), part
@@ -48,7 +48,7 @@ def test_an_empty_population_can_be_shown(tmp_path: Path) -> None:
     spec = make_env("rendezvous/mppmr", 1).spec
     PopulationWriter(tmp_path, spec, method="xpm_wm", config_digest="d", seed=0)
     population = load_population(tmp_path)
-    assert describe(population)["members"] == [] and describe(population)["total_steps"] == 0
+    assert describe_population(population)["members"] == [] and describe_population(population)["total_steps"] == 0
     text = io.StringIO()
-    Console(file=text, width=100).print(render(population))
+    Console(file=text, width=100).print(render_population(population))
     assert "0 environment steps" in text.getvalue()

@@ -1,0 +1,101 @@
+"""Figures as text, and pandas frames as CSV, Markdown and tables for the terminal. Every report uses these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+UNKNOWN = "-"
+"""Text of a figure that is not known."""
+
+Spread = dict[str, float | None]
+"""Mean, least and largest of a figure over several runs: keys mean, low, high."""
+
+
+def number_text(value: float | None, digits: int = 2) -> str:
+    """A number with `digits` digits after the point."""
+    return UNKNOWN if value is None else f"{value:.{digits}f}"
+
+
+def estimate_text(figure: Mapping[str, float | None], digits: int = 2) -> str:
+    """`mean ± standard error` of a figure of a JSON report."""
+    mean, error = figure["mean"], figure["standard_error"]
+    if mean is None or error is None:
+        return number_text(mean, digits)
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"
+
+
+def range_text(spread: Mapping[str, float | None], digits: int = 2) -> str:
+    """`mean (low to high)`, the mean alone where all values are equal."""
+    low, high = spread["low"], spread["high"]
+    if low is None or high is None or low == high:
+        return number_text(spread["mean"], digits)
+    return f"{number_text(spread['mean'], digits)} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def steps_text(value: float, _: int | None = None) -> str:
+    """Steps in short: 250k, 1.5M. The second argument is matplotlib's, which formats ticks with this."""
+    for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.3g}"
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """`seed 1` or `seeds 1, 2, 3`."""
+    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+
+
+def spread_of(values: Iterable[float | None]) -> Spread:
+    """Mean, least and largest of the values that are known; all None where none is."""
+    known = pd.Series(list(values), dtype=float).dropna()
+    if known.empty:
+        return {"mean": None, "low": None, "high": None}
+    return {"mean": float(known.mean()), "low": float(known.min()), "high": float(known.max())}
+
+
+def to_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    """CSV with these columns. Missing values and None stay empty, other keys are left out."""
+    frame = pd.DataFrame(list(rows), columns=list(columns), dtype=object)  # of objects: None makes no float of an int
+    return frame.to_csv(index=False, lineterminator="\n")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table for people.
+
+    Attributes:
+        title: of the table.
+        frame: cells as text, in the order of rows and columns; its index is not shown.
+        labels: columns from the left that hold labels; the others hold figures and stand to the right.
+        dim: numbers of the rows that are given for comparison.
+        bold: (row, column) of the cells that stand out.
+    """
+
+    title: str
+    frame: pd.DataFrame
+    labels: int = 1
+    dim: frozenset[int] = frozenset()
+    bold: frozenset[tuple[int, int]] = frozenset()
+
+    def to_markdown(self) -> str:
+        """The table alone, without its title."""
+        sides = ["left" if number < self.labels else "right" for number in range(self.frame.shape[1])]
+        return self.frame.to_markdown(index=False, disable_numparse=True, colalign=sides)
+
+    def to_rich(self) -> Table:
+        """For the terminal."""
+        table = Table(title=escape(self.title))
+        for number, label in enumerate(self.frame.columns):
+            is_label = number < self.labels
+            table.add_column(escape(str(label)), justify="left" if is_label else "right", no_wrap=is_label)
+        for row, cells in enumerate(self.frame.to_numpy()):
+            texts = [Text(str(cell), "bold" if (row, column) in self.bold else "") for column, cell in enumerate(cells)]
+            table.add_row(*texts, style="dim" if row in self.dim else None)
+        return table
