@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 
 def elbo_terms(
-    outputs: Tensor, target: Tensor, mean: Tensor, log_variance: Tensor, *, binary: bool
-) -> tuple[Tensor, Tensor]:
+    outputs: Float[Tensor, "R F"],
+    target: Float[Tensor, "R F"],
+    mean: Float[Tensor, "R Z"],
+    log_variance: Float[Tensor, "R Z"],
+    *,
+    binary: bool,
+) -> tuple[Float[Tensor, " R"], Float[Tensor, " R"]]:
     """-ln p(o | z), up to a constant, and KL[q(z | o) || N(0, 1)], both (R,), to be minimised.
 
     Args:

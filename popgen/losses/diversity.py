@@ -9,6 +9,7 @@ A sign is applied to the advantage before any surrogate or clipping; value losse
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 
 from popgen.types import Kind
@@ -16,7 +17,9 @@ from popgen.types import Kind
 SIGN: dict[Kind, float] = {Kind.SP: +1.0, Kind.MP: +1.0, Kind.XP: -1.0}
 
 
-def signed_advantage(kind: Kind, advantage: Tensor, *, weight: float, scale: Tensor | float) -> Tensor:
+def signed_advantage(
+    kind: Kind, advantage: Float[Tensor, "*rows"], *, weight: float, scale: Float[Tensor, ""] | float
+) -> Float[Tensor, "*rows"]:
     """Advantage as it enters the policy gradient: sign x weight x advantage / scale.
 
     `scale` comes from *self-play* for every kind (the on-policy baselines take the kind's own spread where that is

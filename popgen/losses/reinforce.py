@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 
-def reinforce(log_prob: Tensor, advantage: Tensor, entropy: Tensor, weight: Tensor, *, entropy_scale: float) -> Tensor:
+def reinforce(
+    log_prob: Float[Tensor, "*rows"],
+    advantage: Float[Tensor, "*#rows"],
+    entropy: Float[Tensor, "*rows"],
+    weight: Float[Tensor, "*#rows"],
+    *,
+    entropy_scale: float,
+) -> Float[Tensor, ""]:
     """Policy-gradient loss, to be minimised:  -E[w (A log pi(a|z) + eta H[pi])].
 
     All tensors broadcast to (H, B, ...); `advantage` and `weight` carry no gradient. `weight` is the
@@ -27,7 +35,7 @@ class ReturnScale(nn.Module):
         self.register_buffer("range", torch.zeros(()))
         self.register_buffer("weight", torch.zeros(()))
 
-    def update(self, returns: Tensor) -> Tensor:
+    def update(self, returns: Float[Tensor, "*rows"]) -> Float[Tensor, ""]:
         """Take in a batch of returns; the new scale (a scalar, no gradient)."""
         quantiles = torch.tensor(self.percentiles, device=returns.device) / 100.0
         low, high = torch.quantile(returns.detach().float().flatten(), quantiles)
@@ -35,6 +43,6 @@ class ReturnScale(nn.Module):
         self.weight.mul_(self.decay).add_(1.0 - self.decay)
         return self.value()
 
-    def value(self) -> Tensor:
+    def value(self) -> Float[Tensor, ""]:
         """max(1, bias-corrected moving range)."""
         return (self.range / self.weight.clamp(min=1e-8)).clamp(min=1.0)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def lambda_return(reward: Tensor, value: Tensor, discount: Tensor, lam: float) -> Tensor:
+def lambda_return(
+    reward: Float[Tensor, "H B"], value: Float[Tensor, "H+1 B"], discount: Float[Tensor, "H B"], lam: float
+) -> Float[Tensor, "H B"]:
     """Recursive lambda-target (paper, appendix D.1; Dreamer).
 
         R_t = r_{t+1} + gamma_{t+1} ((1 - lambda) v_{t+1} + lambda R_{t+1}),   R_H = v_H
@@ -14,7 +17,7 @@ def lambda_return(reward: Tensor, value: Tensor, discount: Tensor, lam: float) -
     Args:
         reward: (H, B), r_{t+1}, what step t earned.
         value: (H + 1, B), v_0 .. v_H.
-        discount: (H, B), gamma times the probability that the episode goes on after step t.
+        discount: (H, B), gamma times the probability that the episode continues after step t.
         lam: lambda in [0, 1].
 
     Returns:
@@ -30,7 +33,9 @@ def lambda_return(reward: Tensor, value: Tensor, discount: Tensor, lam: float) -
     return torch.stack(returns[::-1])
 
 
-def gae(reward: Tensor, value: Tensor, discount: Tensor, lam: float) -> Tensor:
+def gae(
+    reward: Float[Tensor, "H B"], value: Float[Tensor, "H+1 B"], discount: Float[Tensor, "H B"], lam: float
+) -> Float[Tensor, "H B"]:
     """Generalised advantage estimation (Schulman et al. 2016): the lambda-return less the value.
 
     Args as in `lambda_return`. Returns (H, B) advantages.

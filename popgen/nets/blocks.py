@@ -62,7 +62,7 @@ class NormGRUCell(nn.Module):
         return hidden + update * (candidate - hidden)
 
 
-def _conv(
+def _make_convolution(
     kind: type[nn.Conv2d] | type[nn.ConvTranspose2d],
     inputs: int,
     outputs: int,
@@ -93,7 +93,7 @@ class ConvEncoder(nn.Module):
         width, height, planes = shape
         parts: list[nn.Module] = []
         for kernel in kernels:
-            parts += [_conv(nn.Conv2d, planes, channels, kernel), *_after_conv(channels, activation, norm)]
+            parts += [_make_convolution(nn.Conv2d, planes, channels, kernel), *_after_conv(channels, activation, norm)]
             planes = channels
         self.layers = nn.Sequential(*parts)
         self.features = channels * width * height
@@ -126,7 +126,9 @@ class ConvDecoder(nn.Module):
         for index, kernel in enumerate(reversed(kernels)):
             last = index == len(kernels) - 1
             parts += _after_conv(channels, activation, norm)
-            parts.append(_conv(nn.ConvTranspose2d, channels, planes if last else channels, kernel, bias=not last))
+            parts.append(
+                _make_convolution(nn.ConvTranspose2d, channels, planes if last else channels, kernel, bias=not last)
+            )
         self.layers = nn.Sequential(*parts)
         self.bias = nn.Parameter(torch.zeros(self.width, self.height, planes))
 

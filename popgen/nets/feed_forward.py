@@ -148,7 +148,7 @@ class ValueNet(FeedForwardNet):
         variance = (self.square / self.weight - mean.square()).clamp(min=1e-6)
         return ReturnStatistics(mean, variance.sqrt())
 
-    def value(self, obs: Shaped[Tensor, "R *shape"], extras: Float[Tensor, "R X"]) -> Float[Tensor, " R"]:
+    def value(self, obs: Shaped[Tensor, "R ..."], extras: Float[Tensor, "R X"]) -> Float[Tensor, " R"]:
         """Expected returns."""
         mean, deviation = self.statistics()
         return self(obs, extras).squeeze(-1) * deviation + mean

@@ -34,14 +34,14 @@ class PartnerStrength:
             return
         if self.rule == "max_window":
             self.forget(partner)
-        self._remember(self.returns, partner, returns)
-        self._remember(self._scores, partner, scores)
+        self._remember_values(self.returns, partner, returns)
+        self._remember_values(self._scores, partner, scores)
         if self.rule == "max_buffer":
             total, count = self._sums.get(partner, [0.0, 0])
             self._sums[partner] = [total + float(np.sum(returns)), count + len(returns)]
             self.forget(partner)
 
-    def _remember(self, memory: dict[int, deque[float]], partner: int, values: Iterable[float]) -> None:
+    def _remember_values(self, memory: dict[int, deque[float]], partner: int, values: Iterable[float]) -> None:
         memory.setdefault(partner, deque(maxlen=self.window)).extend(float(value) for value in values)
 
     def forget(self, partner: int) -> None:
@@ -53,11 +53,11 @@ class PartnerStrength:
         """Strength, the mean return, of every partner seen."""
         if self.rule == "max_buffer":
             return {partner: total / count for partner, (total, count) in self._sums.items()}
-        return _means(self.returns)
+        return _mean_of_each(self.returns)
 
     def mean_scores(self) -> dict[int, float]:
         """Partner -> mean score of the episodes remembered, of those that have some."""
-        return _means(self._scores)
+        return _mean_of_each(self._scores)
 
     def state(self) -> dict[str, Any]:
         """JSON-able."""
@@ -72,11 +72,11 @@ class PartnerStrength:
         self.returns, self._scores = {}, {}
         for memory, name in ((self.returns, "returns"), (self._scores, "scores")):
             for partner, values in state[name].items():
-                self._remember(memory, int(partner), values)
+                self._remember_values(memory, int(partner), values)
         self._sums = {int(partner): list(sums) for partner, sums in state["sums"].items()}
 
 
-def _means(memory: Mapping[int, deque[float]]) -> dict[int, float]:
+def _mean_of_each(memory: Mapping[int, deque[float]]) -> dict[int, float]:
     return {partner: float(np.mean(values)) for partner, values in memory.items() if values}
 
 

@@ -16,7 +16,7 @@ from popgen.types import Segment
 
 
 class Sampler:
-    """Steps B environments with several matches at once; episodes go on from one `collect` to the next.
+    """Steps B environments with several matches at once; episodes continue from one `collect` to the next.
 
     Args:
         env: a batch of exactly as many environments as the matches ask for.
@@ -60,7 +60,7 @@ class Sampler:
         self._weights = np.asarray(env.spec.event_weights)
 
     def state(self) -> dict[str, Any]:
-        """Everything to go on from exactly here, except matches and weights."""
+        """Everything to continue from exactly here, except matches and weights."""
         return {
             "env": self.env.get_state(),
             "generator": self.env.generator_state(),
@@ -71,7 +71,7 @@ class Sampler:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()` of a sampler of the same matches."""
+        """Continue from `state()` of a sampler of the same matches."""
         self.env.set_state(state["env"])
         self.env.load_generator_state(state["generator"])
         self.seating.load_state(state["seating"])

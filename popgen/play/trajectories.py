@@ -66,20 +66,20 @@ class Estimates(NamedTuple):
 
 
 @torch.no_grad()
-def estimate_advantages(found: Trajectories, value: Values, *, discount: float, lam: float) -> Estimates:
+def estimate_advantages(played: Trajectories, value: Values, *, discount: float, lam: float) -> Estimates:
     """GAE of the joint reward under one critic (paper, appendix D.1).
 
     A terminated trajectory has no value after its last step. One that was cut has: the critic's value of the
     observation that it led to, which enters as discount * v in its last reward. No advantage flows from a trajectory
     into the one before it in its column.
     """
-    time, count = found.reward.shape
+    time, count = played.reward.shape
     columns = torch.arange(count)
-    values = value(found.obs.flatten(0, 1), columns.repeat(time + 1)).view(time + 1, count)
-    reward = found.reward.clone()
-    if len(found.cut_at):
-        rows, where = found.cut_at.unbind(-1)
-        reward[rows, where] += discount * value(found.cut_obs, where)
-    going_on: Bool[Tensor, "T N"] = ~(found.cut | found.terminated)
-    advantage = gae(reward, values, discount * going_on.float(), lam)
+    values = value(played.obs.flatten(0, 1), columns.repeat(time + 1)).view(time + 1, count)
+    reward = played.reward.clone()
+    if len(played.cut_at):
+        rows, where = played.cut_at.unbind(-1)
+        reward[rows, where] += discount * value(played.cut_obs, where)
+    continues: Bool[Tensor, "T N"] = ~(played.cut | played.terminated)
+    advantage = gae(reward, values, discount * continues.float(), lam)
     return Estimates(advantage, advantage + values[:-1])

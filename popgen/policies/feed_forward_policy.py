@@ -87,7 +87,7 @@ class FeedForwardPolicy:
         return weights_of(self.net)
 
     def load(self, weights: Mapping[str, np.ndarray]) -> None:
-        """Take over `weights()` of a policy of the same sizes; raises ValueError for others."""
+        """Load `weights()` of a policy of the same sizes; raises ValueError for others."""
         load_weights(self.net, weights)
 
     @classmethod

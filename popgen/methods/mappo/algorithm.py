@@ -231,7 +231,7 @@ class Mappo(PPO):
         return self._ask_learner(lambda learner: learner.critics(member))
 
     def snapshot(self) -> dict[str, Any]:
-        """Everything to go on from exactly here: learner, runners, partners, generators, counters."""
+        """Everything to continue from exactly here: learner, runners, partners, generators, counters."""
         runners = dict(self._ask_runners("snapshot", {}))
         return {
             "learner": self._ask_learner(lambda learner: learner.snapshot()),
@@ -241,7 +241,7 @@ class Mappo(PPO):
         }
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        """Go on from `snapshot()` of an algorithm of the same job.
+        """Continue from `snapshot()` of an algorithm of the same job.
 
         Raises:
             KeyError, ValueError: it is of another job.

@@ -121,7 +121,7 @@ class BatchedRunner(EnvRunner):
 
     @never_raises
     def restore(self, *, state: Mapping[str, Any]) -> None:
-        """Go on from `snapshot()` of this runner."""
+        """Continue from `snapshot()` of this runner."""
         self.pool.load_state(state)
 
     def get_spaces(self) -> dict[str, Any]:

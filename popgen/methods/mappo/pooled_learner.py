@@ -163,13 +163,13 @@ class PooledLearner(PPOTorchLearner):
         }
 
     def snapshot(self) -> dict[str, Any]:
-        """Everything to go on from exactly here."""
+        """Everything to continue from exactly here."""
         optimisers = {name: optimiser_state(optimiser) for name, optimiser in self._named_optimizers.items()}
         modules = {str(member): weights_of(self._module_of(member)) for member in self.config.job.learning}
         return {"modules": modules, "optimisers": optimisers, "order": self._order.get_state().numpy().copy()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from `snapshot()` of a learner of the same job."""
+        """Continue from `snapshot()` of a learner of the same job."""
         for member, weights in state["modules"].items():
             load_weights(self._module_of(int(member)), weights)
         for name, saved in state["optimisers"].items():

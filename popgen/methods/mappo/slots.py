@@ -119,7 +119,7 @@ class SlotPool:
         return np.arange(columns.start, columns.stop)
 
     def state(self) -> dict[str, Any]:
-        """Everything to go on from exactly here, but for matches and actors."""
+        """Everything to continue from exactly here, but for matches and actors."""
         return {
             "states": self.states.copy(),
             "age": self.age.copy(),
@@ -133,7 +133,7 @@ class SlotPool:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state()` of a pool of the same matches."""
+        """Continue from `state()` of a pool of the same matches."""
         self.states[:], self.age[:] = state["states"], state["age"]
         self.whole[:], self.switch[:] = state["whole"], state["switch"]
         self.score[:], self.reward[:] = state["score"], state["reward"]

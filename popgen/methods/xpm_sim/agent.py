@@ -283,7 +283,7 @@ class XpmSimLearner:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()` of a learner of the same member and partners."""
+        """Continue from `state()` of a learner of the same member and partners."""
         w.load_weights(self.actor.net, state["actor"])
         if self.encoder is not None:
             self.encoder.load_state(state["encoder"])

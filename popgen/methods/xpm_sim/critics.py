@@ -87,7 +87,7 @@ class MemberCritics:
         def inputs(obs: Tensor, columns: Tensor) -> CriticInputs:
             return CriticInputs(self._join_players(obs), torch.zeros(len(obs), 0))
 
-        return self._evaluate(batch, batch.columns.self_play, SELF, inputs)
+        return self._evaluate_columns(batch, batch.columns.self_play, SELF, inputs)
 
     def evaluate_cross_play(self, batch: SimulatedBatch, partner: int) -> Evaluation:
         """The cross-play columns: the critic sees the member's own view first, its seat, and which partner it is."""
@@ -99,13 +99,13 @@ class MemberCritics:
             both = torch.stack([obs[torch.arange(len(obs)), seat], obs[torch.arange(len(obs)), 1 - seat]], 1)
             return CriticInputs(self._join_players(both), torch.cat([eye[seat], which.expand(len(obs), -1)], -1))
 
-        return self._evaluate(batch, batch.columns.cross_play, SHARED if self.shared else str(partner), inputs)
+        return self._evaluate_columns(batch, batch.columns.cross_play, SHARED if self.shared else str(partner), inputs)
 
     def _join_players(self, obs: Tensor) -> Tensor:
         """What critics see of all players' observations (R, P, *view.shape), the first player's first."""
         return joint(obs, self.observed) if self.encoder is None else self.encoder.latent(obs[:, 0])
 
-    def _evaluate(self, batch: SimulatedBatch, columns: slice, key: str, inputs: InputsOf) -> Evaluation:
+    def _evaluate_columns(self, batch: SimulatedBatch, columns: slice, key: str, inputs: InputsOf) -> Evaluation:
         critic, config = self.net(key), self.config
 
         def value(obs: Tensor, column: Tensor) -> Tensor:

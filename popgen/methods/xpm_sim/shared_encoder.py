@@ -49,11 +49,11 @@ class SharedEncoder:
         totals = []
         for _ in range(self.config.encoder_updates):
             obs = starts.env.encode(starts.buffered(self.config.encoder_batch, self.rng))
-            totals.append(self._step(torch.from_numpy(obs).flatten(0, 1)))
+            totals.append(self._step_encoder(torch.from_numpy(obs).flatten(0, 1)))
         reconstruction, divergence = np.mean(totals, axis=0)
         return {"encoder_reconstruction": float(reconstruction), "encoder_kl": float(divergence)}
 
-    def _step(self, obs: Tensor) -> tuple[float, float]:
+    def _step_encoder(self, obs: Tensor) -> tuple[float, float]:
         vae = self.vae
         mean, log_variance = vae.encode(obs)
         noise = torch.randn(mean.shape, generator=self.generator)
@@ -65,7 +65,7 @@ class SharedEncoder:
         return float(errors.detach().mean()), float(divergences.detach().mean())
 
     def state(self) -> dict[str, Any]:
-        """Everything to go on from exactly here."""
+        """Everything to continue from exactly here."""
         return {
             "vae": w.weights_of(self.vae),
             "optimiser": w.optimiser_state(self.optimiser),
@@ -74,7 +74,7 @@ class SharedEncoder:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`, of the member before or of this one."""
+        """Continue from `state()`, of the member before or of this one."""
         w.load_weights(self.vae, state["vae"])
         w.load_optimiser_state(self.optimiser, state["optimiser"])
         self.rng.bit_generator.state = state["rng"]

@@ -202,7 +202,7 @@ class Simulator:
         return {"running": running, "generator": self.generator.get_state().numpy()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`."""
+        """Continue from `state()`."""
         running = state["running"]
         self.running = np.array(running["states"]) if running else None
         self.age = np.array(running["age"]) if running else np.zeros(0, np.int64)

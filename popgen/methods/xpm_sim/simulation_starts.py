@@ -48,20 +48,20 @@ class StartStates:
 
     def self_play(self, count: int) -> np.ndarray:
         """(count, S): `starts_initial` of them start states, the others states of B_SP."""
-        return self._mixed(count, self.config.starts_initial, self.sp, None)
+        return self._draw_mixed(count, self.config.starts_initial, self.sp, None)
 
     def restart(self, count: int) -> np.ndarray:
         """(count, S) states of B_XP, with any partner (paper, eq. XPM-Sim)."""
-        return self._mixed(count, 0.0, self.xp, None)
+        return self._draw_mixed(count, 0.0, self.xp, None)
 
     def cross_play(self, count: int, partner: int) -> np.ndarray:
         """(count, S): `xp_initial` of them start states, the others states of B_XP with that partner."""
-        return self._mixed(count, self.config.xp_initial, self.xp, partner)
+        return self._draw_mixed(count, self.config.xp_initial, self.xp, partner)
 
     def buffered(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """(count, S) states of both buffers, all their rows alike; start states where both are empty."""
         rows = [np.flatnonzero(replay.stream[: replay.size] >= 0) for replay in (self.sp, self.xp)]
-        sizes = [len(found) for found in rows]
+        sizes = [len(part) for part in rows]
         if not sum(sizes):
             return self.initial(count)
         chosen = rng.integers(0, sum(sizes), count)
@@ -69,20 +69,20 @@ class StartStates:
         parts.append(self.xp.states[rows[1][chosen[chosen >= sizes[0]] - sizes[0]]])
         return np.concatenate(parts)
 
-    def _mixed(self, count: int, initial: float, replay: Replay, partner: int | None) -> np.ndarray:
+    def _draw_mixed(self, count: int, initial: float, replay: Replay, partner: int | None) -> np.ndarray:
         """Where the buffer has nothing that fits, all are start states."""
-        found = self.recent(replay, partner)
-        fresh = self.rng.random(count) < initial if len(found) else np.ones(count, bool)
+        rows = self.recent(replay, partner)
+        fresh = self.rng.random(count) < initial if len(rows) else np.ones(count, bool)
         states = np.empty((count, self.env.spec.state_size), self.env.spec.state_dtype)
         states[fresh] = self.initial(int(fresh.sum()))
-        states[~fresh] = replay.states[self.rng.choice(found, int((~fresh).sum()))] if len(found) else 0
+        states[~fresh] = replay.states[self.rng.choice(rows, int((~fresh).sum()))] if len(rows) else 0
         return states
 
     def recent(self, replay: Replay, partner: int | None) -> np.ndarray:
         """Rows of the last `recent` episodes' worth of steps that match, terminal states left out."""
         last = self.config.recent * self.env.spec.horizon
-        found = replay.rows(Query(partner=partner, last=last))
-        return found[~replay.terminal[found]]
+        rows = replay.rows(Query(partner=partner, last=last))
+        return rows[~replay.terminal[rows]]
 
     def state(self) -> dict[str, Any]:
         """Both buffers and the generators."""
@@ -94,7 +94,7 @@ class StartStates:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`."""
+        """Continue from `state()`."""
         self.sp.load_state(state["sp"])
         self.xp.load_state(state["xp"])
         self.rng.bit_generator.state = state["rng"]

@@ -66,7 +66,7 @@ class WorldModelPolicy:
         return latent | {"generator": self._generator.get_state().numpy()}
 
     def load_memory(self, memory: dict[str, Any]) -> None:
-        """Go on from `memory()`."""
+        """Continue from `memory()`."""
         self._latent = Latent(*(torch.from_numpy(np.array(memory[name])) for name in ("h", "z")))
         self._generator.set_state(torch.from_numpy(np.array(memory["generator"])))
 
@@ -82,7 +82,7 @@ class WorldModelPolicy:
         return w.weights_of(self._parts)
 
     def load(self, weights: Mapping[str, np.ndarray]) -> None:
-        """Take over `weights()` of a policy of the same sizes (else ValueError); the running episodes' latents stay."""
+        """Load `weights()` of a policy of the same sizes (else ValueError); the running episodes' latents stay."""
         w.load_weights(self._parts, weights)
 
     @classmethod
@@ -96,12 +96,13 @@ class WorldModelPolicy:
         Raises:
             ValueError: a field that decides it is missing or wrong, or the weights do not fit.
         """
-        policy = cls(_acting(config, "world_model", WorldModelConfig), _acting(config, "agent", AgentConfig), spec)
+        model = _read_section(config, "world_model", WorldModelConfig)
+        policy = cls(model, _read_section(config, "agent", AgentConfig), spec)
         policy.load(weights)
         return policy
 
 
-def _acting(config: Mapping[str, Any], section: str, schema: type[_S]) -> _S:
+def _read_section(config: Mapping[str, Any], section: str, schema: type[_S]) -> _S:
     """The schema from the acting fields of one section; the rest is at its defaults."""
     given = config.get(section)
     if not isinstance(given, Mapping):

@@ -19,7 +19,6 @@ from popgen.losses.schedules import geometric, linear
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent_networks import SELF, AgentNetworks
 from popgen.methods.xpm_wm.agent_targets import (
-    Losses,
     PolicyTarget,
     cross_play_target,
     sample_losses,
@@ -133,7 +132,7 @@ class AgentLearner:
         partner = self.choose_partner()
         imagined, seats = self.imagine_play(partner)
         count = self.config.starts_sp
-        with self._autocast():
+        with self._cast_automatically():
             own = self.self_play(imagined.of_columns(slice(None, count)))
             targets = [own]
             if partner is not None:
@@ -145,7 +144,7 @@ class AgentLearner:
         self.playing += self.plays
         return figures
 
-    def _autocast(self) -> torch.autocast:
+    def _cast_automatically(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16)
 
     def lambda_now(self) -> float:
@@ -216,8 +215,8 @@ class AgentLearner:
 
     def _step_networks(self, parts: Sequence[Samples]) -> dict[str, float]:
         """One step of the actor and of the critics that the samples are of."""
-        with self._autocast():
-            losses = [self.losses(part) for part in parts]
+        with self._cast_automatically():
+            losses = [sample_losses(self.networks, part) for part in parts]
         zero = torch.zeros((), device=self.device)
         self.networks.step_actor(sum((loss.policy for loss in losses), zero))
         self.networks.step_critics(sum((loss.critic for loss in losses), zero))
@@ -225,10 +224,6 @@ class AgentLearner:
         for part, loss in zip(parts, losses, strict=True):
             figures["critic_loss_sp" if part.key == SELF else "critic_loss_xp"] = float(loss.critic.detach())
         return figures
-
-    def losses(self, samples: Samples) -> Losses:
-        """Of the policy and of the critic of the samples."""
-        return sample_losses(self.networks, samples)
 
     # ---- what is kept --------------------------------------------------------------------------------------------
 

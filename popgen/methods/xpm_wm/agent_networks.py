@@ -25,7 +25,7 @@ class ReturnTargets(NamedTuple):
     """Lambda-returns (H, B) and values (H + 1, B), without gradient."""
 
     returns: Float[Tensor, "H B"]
-    value: Float[Tensor, "H+1 B"]
+    value: Float[Tensor, "T B"]
 
 
 class AgentNetworks:
@@ -77,7 +77,7 @@ class AgentNetworks:
         return critic
 
     @torch.no_grad()
-    def targets(self, imagined: Imagined, key: int, seat: Int[Tensor, "H+1 B"]) -> ReturnTargets:
+    def targets(self, imagined: Imagined, key: int, seat: Int[Tensor, "T B"]) -> ReturnTargets:
         """Lambda-returns under the slow critic of `key`, which is told the agent's seat."""
         value = self.critic(key, slow=True).value(imagined.latent, seat)
         discount = self.config.discount * imagined.keep
@@ -85,13 +85,13 @@ class AgentNetworks:
 
     def step_actor(self, loss: Tensor) -> None:
         """One step of the actor down the gradient of `loss`."""
-        self._descend(self.actor_optimiser, loss, self.actor.parameters())
+        self._step_down(self.actor_optimiser, loss, self.actor.parameters())
 
     def step_critics(self, loss: Tensor) -> None:
         """The same for the critics."""
-        self._descend(self.critic_optimiser, loss, self.critics.parameters())
+        self._step_down(self.critic_optimiser, loss, self.critics.parameters())
 
-    def _descend(self, optimiser: torch.optim.Optimizer, loss: Tensor, parameters: Iterable[nn.Parameter]) -> None:
+    def _step_down(self, optimiser: torch.optim.Optimizer, loss: Tensor, parameters: Iterable[nn.Parameter]) -> None:
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)

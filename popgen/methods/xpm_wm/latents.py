@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float, Integer, UInt8
 from torch import Tensor
 
 
@@ -33,13 +34,15 @@ class Latent:
         return Latent(self.h[index], self.z[index])
 
 
-def probabilities(logits: Tensor, unimix: float) -> Tensor:
+def probabilities(logits: Float[Tensor, "*batch C G"], unimix: float) -> Float[Tensor, "*batch C G"]:
     """Softmax over the classes, mixed with a uniform share (DreamerV3). logits (..., C, G) -> same."""
     probs = torch.softmax(logits, dim=-2)
     return probs * (1.0 - unimix) + unimix / logits.shape[-2]
 
 
-def sample_one_hot(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+def sample_one_hot(
+    probs: Float[Tensor, "*batch C G"], generator: torch.Generator | None = None
+) -> Float[Tensor, "*batch C G"]:
     """One-hot samples (..., C, G) by inverting the cumulative distribution; no gradient."""
     cumulative = probs.detach().float().cumsum(dim=-2)
     total = cumulative[..., -1:, :]
@@ -50,7 +53,7 @@ def sample_one_hot(probs: Tensor, generator: torch.Generator | None = None) -> T
     return one_hot
 
 
-def mode_one_hot(probs: Tensor) -> Tensor:
+def mode_one_hot(probs: Float[Tensor, "*batch C G"]) -> Float[Tensor, "*batch C G"]:
     """The most likely class of every group, the first of equals: one-hot (..., C, G); no gradient.
 
     Comparing with the maximum is twenty times faster than `argmax` over a dimension that is not the last.
@@ -60,12 +63,14 @@ def mode_one_hot(probs: Tensor) -> Tensor:
     return best * (best.cumsum(dim=-2) <= 1.0)
 
 
-def straight_through(probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+def straight_through(
+    probs: Float[Tensor, "*batch C G"], generator: torch.Generator | None = None
+) -> Float[Tensor, "*batch C G"]:
     """One-hot samples whose gradient is that of the probabilities."""
     return sample_one_hot(probs, generator) + probs - probs.detach()
 
 
-def kl_divergence(p: Tensor, q: Tensor) -> Tensor:
+def kl_divergence(p: Float[Tensor, "*batch C G"], q: Float[Tensor, "*batch C G"]) -> Float[Tensor, "*batch"]:
     """KL[p || q] summed over groups; probabilities (..., C, G) -> (...)."""
     return (p * (p.log() - q.log())).sum(dim=(-2, -1))
 
@@ -83,12 +88,12 @@ def player_masks(groups: int, joint_groups: int, classes: int) -> Tensor:
     return mask[:, None, :].expand(2, classes, groups).reshape(2, classes * groups).contiguous()
 
 
-def to_indices(one_hot: Tensor) -> Tensor:
+def to_indices(one_hot: Float[Tensor, "*batch C G"]) -> UInt8[Tensor, "*batch G"]:
     """(..., C, G) one-hot -> (..., G) uint8 class indices, 1 / C of the memory."""
     return one_hot.argmax(dim=-2).to(torch.uint8)
 
 
-def from_indices(indices: Tensor, classes: int) -> Tensor:
+def from_indices(indices: Integer[Tensor, "*batch G"], classes: int) -> Float[Tensor, "*batch {classes} G"]:
     """(..., G) class indices -> (..., C, G) float one-hot."""
     grid = torch.arange(classes, device=indices.device).unsqueeze(-1)
     return (indices.unsqueeze(-2) == grid).float()

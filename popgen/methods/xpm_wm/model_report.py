@@ -16,7 +16,7 @@ from popgen.methods.xpm_wm.world_model_losses import event_counts
 def model_report(learner: ModelLearner, windows: Windows, context: int) -> dict[str, float]:
     """Figures on real windows of at least `context + OPEN_LOOP` states.
 
-    After `context` observed steps the model goes on from its prior with the real actions, one and OPEN_LOOP steps:
+    After `context` observed steps the model continues from its prior with the real actions, one and OPEN_LOOP steps:
     event precision and recall (all events, and each by name), and the share of exact joint observations.
     Windows in which an episode begins after the context are left out.
     """

@@ -100,7 +100,7 @@ class Replay:
         order = np.concatenate([np.arange(len(ended)), np.flatnonzero(ended) + 0.5]).argsort(kind="stable")
         source = np.concatenate([np.arange(len(ended)), np.flatnonzero(ended)])[order]
         arrival = order >= len(ended)
-        rows = self._reserve(len(source))
+        rows = self._reserve_rows(len(source))
         self.states[rows] = segment.states[source, column]
         self.states[rows[arrival]] = segment.next_states[source[arrival], column]
         self.actions[rows] = segment.actions[source, column]
@@ -116,7 +116,7 @@ class Replay:
         self.streams += 1
         self.added += len(rows)
 
-    def _reserve(self, count: int) -> np.ndarray:
+    def _reserve_rows(self, count: int) -> np.ndarray:
         if count > self.capacity:
             raise ValueError(f"a stream of {count} rows does not fit a replay of {self.capacity}")
         if self.head + count > self.capacity:
@@ -131,10 +131,10 @@ class Replay:
         """Row numbers that match (and at which a window can show `event`), oldest first; cached until the next add."""
         key = (query, event)
         if key not in self._cache:
-            self._cache[key] = self._matching(query) if event is None else self._showing(self.rows(query), event)
+            self._cache[key] = self._find_rows(query) if event is None else self._rows_showing(self.rows(query), event)
         return self._cache[key]
 
-    def _matching(self, query: Query) -> np.ndarray:
+    def _find_rows(self, query: Query) -> np.ndarray:
         match = self.stream[: self.size] >= 0
         if query.owner is not None:
             owner = self.owner[: self.size]
@@ -143,17 +143,17 @@ class Replay:
             match &= self.kind[: self.size] == KIND_CODE[query.kind]
         if query.partner is not None:
             match &= self.partner[: self.size] == query.partner
-        found = np.flatnonzero(match)
-        wrapped = int(np.searchsorted(found, self.head))  # rows from the head on are the ring's oldest
-        found = np.concatenate([found[wrapped:], found[:wrapped]])
-        kept = int(np.ceil(len(found) * query.recent))
-        return found[len(found) - (kept if query.last is None else min(kept, query.last)) :]
+        rows = np.flatnonzero(match)
+        wrapped = int(np.searchsorted(rows, self.head))  # rows from the head on are the ring's oldest
+        rows = np.concatenate([rows[wrapped:], rows[:wrapped]])
+        kept = int(np.ceil(len(rows) * query.recent))
+        return rows[len(rows) - (kept if query.last is None else min(kept, query.last)) :]
 
-    def _showing(self, found: np.ndarray, event: int) -> np.ndarray:
+    def _rows_showing(self, rows: np.ndarray, event: int) -> np.ndarray:
         """Those of the rows at which a window can show the event."""
-        found = found[self.events[found, :, event].any(1)]
+        rows = rows[self.events[rows, :, event].any(1)]
         # A window shows an event at the state it led to, which is not stored where an episode was cut.
-        return found[self._whole(found, 2) & ~self.first[(found + 1) % self.capacity]]
+        return rows[self._is_whole(rows, 2) & ~self.first[(rows + 1) % self.capacity]]
 
     def sample(
         self, batch: int, length: int, query: Query, *, event_fraction: float = 0.0, turn: int = 0
@@ -163,48 +163,48 @@ class Replay:
         Raises:
             LookupError: no window of that length matches.
         """
-        starts = self._draw(self.rows(query), batch, length, offset=0)
+        starts = self._draw_starts(self.rows(query), batch, length, offset=0)
         for slot in range(by_event(batch, event_fraction)):
             event = (turn + slot) % self.env.spec.num_events
-            found = self.rows(query, event)
-            if len(found):
+            rows = self.rows(query, event)
+            if len(rows):
                 offset = int(self.rng.integers(0, length - 1))
-                picked = self._draw(found, 1, length, offset=offset, strict=False)
+                picked = self._draw_starts(rows, 1, length, offset=offset, strict=False)
                 if len(picked):
                     starts[slot] = picked[0]
         return starts
 
     def before_events(self, batch: int, length: int, query: Query, events: list[int], reach: int) -> np.ndarray:
         """First rows of windows whose last state lies up to `reach` steps before one of the events, in its episode."""
-        found = (
-            np.unique(np.concatenate([self.rows(query, event) for event in events])) if events else np.array([], int)
-        )
-        if not len(found):
+        rows = np.unique(np.concatenate([self.rows(query, event) for event in events])) if events else np.array([], int)
+        if not len(rows):
             return self.sample(batch, length, query)
         lead = self.rng.integers(0, reach, size=batch * 4)
-        picked = found[self.rng.integers(0, len(found), size=batch * 4)]
+        picked = rows[self.rng.integers(0, len(rows), size=batch * 4)]
         last, episode = picked - lead, np.cumsum(self.first[: self.size])
         same = (self.stream[last] == self.stream[picked]) & (episode[last] == episode[picked])
         starts = (last - (length - 1))[same]
-        starts = starts[self._whole(starts, length)][:batch]
+        starts = starts[self._is_whole(starts, length)][:batch]
         missing = batch - len(starts)
         return np.concatenate([starts, self.sample(missing, length, query)]) if missing else starts
 
-    def _draw(self, found: np.ndarray, batch: int, length: int, *, offset: int, strict: bool = True) -> np.ndarray:
+    def _draw_starts(
+        self, rows: np.ndarray, batch: int, length: int, *, offset: int, strict: bool = True
+    ) -> np.ndarray:
         kept: list[np.ndarray] = []
         missing = batch
         for _ in range(50):
-            if missing <= 0 or not len(found):
+            if missing <= 0 or not len(rows):
                 break
-            starts = found[self.rng.integers(0, len(found), size=2 * missing + 8)] - offset
-            starts = starts[self._whole(starts, length)][:missing]
+            starts = rows[self.rng.integers(0, len(rows), size=2 * missing + 8)] - offset
+            starts = starts[self._is_whole(starts, length)][:missing]
             kept.append(starts)
             missing -= len(starts)
         if missing and strict:
             raise LookupError(f"the replay has no window of {length} states that matches")
         return np.concatenate(kept) if kept else np.array([], np.int64)
 
-    def _whole(self, starts: np.ndarray, length: int) -> np.ndarray:
+    def _is_whole(self, starts: np.ndarray, length: int) -> np.ndarray:
         inside = (starts >= 0) & (starts + length <= self.size)
         first, last = self.stream[np.where(inside, starts, 0)], self.stream[np.where(inside, starts + length - 1, 0)]
         return inside & (first == last) & (first >= 0)
@@ -226,9 +226,12 @@ class Replay:
             chosen=np.zeros(len(starts), bool) if chosen is None else chosen,
         )
 
+    def _columns(self) -> dict[str, np.ndarray]:
+        return {name: getattr(self, name) for name in self.COLUMNS}
+
     def state(self) -> dict[str, Any]:
-        """Everything needed to go on: arrays of the filled part, counters and the generator (JSON-able)."""
-        arrays = {name: getattr(self, name)[: self.size].copy() for name in self.COLUMNS}
+        """Everything needed to continue: arrays of the filled part, counters and the generator (JSON-able)."""
+        arrays = {name: column[: self.size].copy() for name, column in self._columns().items()}
         counters = {
             "head": self.head,
             "streams": self.streams,
@@ -238,7 +241,7 @@ class Replay:
         return {"arrays": arrays, "counters": counters}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Undo nothing, take over `state()` of another replay.
+        """Replace the contents with `state()` of another replay.
 
         Raises:
             ValueError: it holds more rows than this one's capacity.
@@ -247,8 +250,8 @@ class Replay:
         if len(arrays["stream"]) > self.capacity:
             raise ValueError(f"{len(arrays['stream'])} rows do not fit a replay of {self.capacity}")
         self.size = len(arrays["stream"])
-        for name in self.COLUMNS:
-            getattr(self, name)[: self.size] = arrays[name]
+        for name, column in self._columns().items():
+            column[: self.size] = arrays[name]
         self.head, self.streams, self.added = (int(counters[name]) for name in ("head", "streams", "added"))
         self.rng.bit_generator.state = counters["rng"]
         self._cache.clear()

@@ -39,7 +39,7 @@ def draw_self_play(
     """
     pools = [np.flatnonzero(starts.pool == pool) for pool in (OLD, NEW_SP, NEW_XP)]
     shares = np.array([1.0 - new_share, new_share * (1.0 - from_xp), new_share * from_xp])
-    return _mix(pools, shares, count, rng)
+    return _draw_mixture(pools, shares, count, rng)
 
 
 def draw_cross_play(
@@ -54,10 +54,10 @@ def draw_cross_play(
     if partner is not None:
         own = own & (starts.partner == partner)
     pools = [np.flatnonzero(starts.pool == OLD), np.flatnonzero(own)]
-    return _mix(pools, np.array([1.0 - new_share, new_share]), count, rng)
+    return _draw_mixture(pools, np.array([1.0 - new_share, new_share]), count, rng)
 
 
-def _mix(pools: list[np.ndarray], shares: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+def _draw_mixture(pools: list[np.ndarray], shares: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     shares = np.where([len(pool) > 0 for pool in pools], np.maximum(shares, 1e-9), 0.0)
     if not shares.any():
         raise LookupError("there are no states to start imagination from")

@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec, ViewSpec
@@ -64,7 +65,7 @@ class JointEncoder(nn.Module):
             )
             inputs = self.conv.features
             self.register_buffer("center", torch.zeros(2, *view.shape))
-        self.trunk = mlp(inputs, None, **_style(config), layers=config.encoder_layers)
+        self.trunk = mlp(inputs, None, **_layer_style(config), layers=config.encoder_layers)
 
     def forward(self, obs: Tensor) -> Tensor:
         if self.conv is None:
@@ -82,7 +83,7 @@ class PlayerDecoder(nn.Module):
     def __init__(self, config: WorldModelConfig, view: ViewSpec, inputs: int) -> None:
         super().__init__()
         flat = len(view.shape) == 1
-        self.trunk = mlp(inputs, view.shape[0] if flat else None, **_style(config), layers=config.decoder_layers)
+        self.trunk = mlp(inputs, view.shape[0] if flat else None, **_layer_style(config), layers=config.decoder_layers)
         self.conv = None
         if not flat:
             self.conv = ConvDecoder(
@@ -121,12 +122,12 @@ class LatentFilter(nn.Module):
         step_inputs = self.latent_size + 2 * self.num_actions
         self.step_net = None
         if config.recurrent_units:
-            style: dict[str, Any] = {**_style(config), "units": config.recurrent_units}
+            style: dict[str, Any] = {**_layer_style(config), "units": config.recurrent_units}
             self.step_net = mlp(step_inputs + config.deter, None, **style, layers=1)
             step_inputs = config.recurrent_units
         self.gru = NormGRUCell(step_inputs, config.deter)
         inputs = config.deter + config.units
-        self.posterior_net = mlp(inputs, self.latent_size, **_style(config), layers=config.posterior_layers)
+        self.posterior_net = mlp(inputs, self.latent_size, **_layer_style(config), layers=config.posterior_layers)
 
     def initial(self, batch: int) -> Latent:
         """The state before the first observation: zeros."""
@@ -136,7 +137,7 @@ class LatentFilter(nn.Module):
             torch.zeros(batch, self.latent_size, device=device, dtype=dtype),
         )
 
-    def transition(self, latent: Latent, actions: Tensor) -> Tensor:
+    def transition(self, latent: Latent, actions: Int[Tensor, "B P"]) -> Float[Tensor, "B D"]:
         """h_t from the state and joint actions (B, P) int64 of step t - 1; actions < 0 count as none."""
         classes = torch.arange(self.num_actions, device=actions.device)
         one_hot = (actions.unsqueeze(-1) == classes).flatten(1).to(latent.h.dtype)
@@ -145,12 +146,14 @@ class LatentFilter(nn.Module):
             inputs = self.step_net(torch.cat([inputs, latent.h], -1))
         return self.gru(inputs, latent.h)
 
-    def posterior(self, h: Tensor, embedding: Tensor) -> Tensor:
+    def posterior(
+        self, h: Float[Tensor, "*batch D"], embedding: Float[Tensor, "*batch U"]
+    ) -> Float[Tensor, "*batch C G"]:
         """q(z | h, o) as probabilities (..., C, G)."""
         logits = self.posterior_net(torch.cat([h, embedding], -1))
         return latents.probabilities(self.grouped(logits), self.config.unimix)
 
-    def grouped(self, flat: Tensor) -> Tensor:
+    def grouped(self, flat: Float[Tensor, "*batch CG"]) -> Float[Tensor, "*batch C G"]:
         """(..., C * G) -> (..., C, G)."""
         return flat.unflatten(-1, (self.config.classes, self.config.groups))
 
@@ -161,7 +164,9 @@ class LatentFilter(nn.Module):
             return obs / self.maxima
         return obs if self.view.scale == 1.0 else obs / self.view.scale
 
-    def before(self, latent: Latent, actions: Tensor, is_first: Tensor) -> tuple[Latent, Tensor]:
+    def before(
+        self, latent: Latent, actions: Int[Tensor, "B P"], is_first: Bool[Tensor, " B"]
+    ) -> tuple[Latent, Int[Tensor, "B P"]]:
         """State and actions of the previous step, blanked where an episode (or window) begins."""
         keep = (~is_first).to(latent.h.dtype).unsqueeze(-1)
         blanked = torch.where(is_first.unsqueeze(-1), torch.full_like(actions, -1), actions)
@@ -169,14 +174,21 @@ class LatentFilter(nn.Module):
 
     @torch.no_grad()
     def filter(
-        self, latent: Latent, obs: Tensor, actions: Tensor, is_first: Tensor, generator: torch.Generator | None = None
+        self,
+        latent: Latent,
+        obs: Shaped[Tensor, "B P *shape"],
+        actions: Int[Tensor, "B P"],
+        is_first: Bool[Tensor, " B"],
+        generator: torch.Generator | None = None,
     ) -> Latent:
         """One step of acting: the state after seeing obs (B, P, *shape), actions (B, P) having led to it."""
         h = self.transition(*self.before(latent, actions, is_first))
         probs = self.posterior(h, self.encoder(self.scaled(obs)))
         return Latent(h, self.drawn(probs, generator))
 
-    def drawn(self, probs: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def drawn(
+        self, probs: Float[Tensor, "*batch C G"], generator: torch.Generator | None = None
+    ) -> Float[Tensor, "*batch CG"]:
         """Latents for acting and imagining, (..., C, G) -> (..., C * G).
 
         `imagination=mode` takes the most likely class: where the task itself is deterministic, a sampled latent
@@ -187,8 +199,12 @@ class LatentFilter(nn.Module):
         return latents.sample_one_hot(probs, generator).flatten(-2)
 
     def observe_posterior(
-        self, obs: Tensor, actions: Tensor, is_first: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[Latent, Tensor]:
+        self,
+        obs: Float[Tensor, "T B P *shape"],
+        actions: Int[Tensor, "T B P"],
+        is_first: Bool[Tensor, "T B"],
+        generator: torch.Generator | None = None,
+    ) -> tuple[Latent, Float[Tensor, "T B C G"]]:
         """Filter a window, time first, with gradients: states (T, B, .) and posteriors (T, B, C, G).
 
         Args:
@@ -227,7 +243,7 @@ class WorldModel(nn.Module):
         self.filter = LatentFilter(config, spec)
         size = self.filter.latent_size
         inputs = config.deter + size
-        style = _style(config)
+        style = _layer_style(config)
         self.prior_net = mlp(config.deter, size, **style, layers=config.prior_layers)
         self.decoders = nn.ModuleList(PlayerDecoder(config, self.filter.view, inputs) for _ in range(2))
         outputs = spec.num_events * spec.num_players
@@ -239,27 +255,31 @@ class WorldModel(nn.Module):
         self.register_buffer("event_weights", weights, persistent=False)
         self.logits = self.filter.view.binary or self.filter.maxima is not None
 
-    def prior(self, h: Tensor) -> Tensor:
+    def prior(self, h: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch C G"]:
         """p(z | h) as probabilities (..., C, G)."""
         return latents.probabilities(self.filter.grouped(self.prior_net(h)), self.config.unimix)
 
     def observe(
-        self, obs: Tensor, actions: Tensor, is_first: Tensor, generator: torch.Generator | None = None
+        self,
+        obs: Float[Tensor, "T B P *shape"],
+        actions: Int[Tensor, "T B P"],
+        is_first: Bool[Tensor, "T B"],
+        generator: torch.Generator | None = None,
     ) -> Observed:
         """Real windows through the model; arguments as `LatentFilter.observe_posterior`."""
         latent, posterior = self.filter.observe_posterior(obs, actions, is_first, generator)
         return Observed(latent, posterior, self.prior(latent.h))
 
-    def step(self, latent: Latent, actions: Tensor, generator: torch.Generator | None = None) -> Latent:
+    def step(self, latent: Latent, actions: Int[Tensor, "B P"], generator: torch.Generator | None = None) -> Latent:
         """One step of imagination: (h, z)_{t+1} from (h, z)_t and joint actions (B, P), z drawn from the prior."""
         h = self.filter.transition(latent, actions)
         return Latent(h, self.filter.drawn(self.prior(h), generator))
 
-    def player_latent(self, latent: Latent, player: int) -> Tensor:
+    def player_latent(self, latent: Latent, player: int) -> Float[Tensor, "*batch DCG"]:
         """(h, z^i) with the other player's private groups blanked: (..., D + C * G)."""
         return torch.cat([latent.h, latent.z * self.masks[player]], -1)
 
-    def decode(self, latent: Latent) -> Tensor:
+    def decode(self, latent: Latent) -> Float[Tensor, ...]:
         """Both players' observations, logits for binary views and counts: (..., P, *shape)."""
         lead = latent.h.shape[:-1]
         views = [
@@ -268,18 +288,20 @@ class WorldModel(nn.Module):
         ]
         return torch.stack(views, dim=len(lead))
 
-    def observation_loss(self, decoded: Tensor, obs: Tensor) -> Tensor:
+    def observation_loss(
+        self, decoded: Float[Tensor, "T B P *shape"], obs: Float[Tensor, "T B P *shape"]
+    ) -> Float[Tensor, "T B"]:
         """-ln p(o | h, z) of both players (T, B), up to a constant; `decoded` and scaled `obs` (T, B, P, *shape).
 
         Bernoulli where all is 0 or 1; the same of n / N for counts n of at most N; else Gaussian.
         """
         return reconstruction(decoded, obs, binary=self.logits, largest=self.filter.maxima)
 
-    def event_logits(self, latent: Latent) -> Tensor:
+    def event_logits(self, latent: Latent) -> Float[Tensor, "*batch PE"]:
         """(..., P * E), player-major."""
         return self.event_head(latent.flat())
 
-    def reward(self, latent: Latent) -> Tensor:
+    def reward(self, latent: Latent) -> Float[Tensor, "*batch"]:
         """Joint reward (...): w . p(r | h, z), summed over players (paper, "event-based rewards").
 
         With `imagination=mode` an event less likely than not counts for nothing.
@@ -289,12 +311,12 @@ class WorldModel(nn.Module):
             probs = probs * (probs > 0.5)
         return (probs * self.event_weights).sum(-1)
 
-    def continuation(self, latent: Latent) -> Tensor:
-        """Probability (...) that the episode goes on from this state."""
+    def continuation(self, latent: Latent) -> Float[Tensor, "*batch"]:
+        """Probability (...) that the episode continues from this state."""
         return torch.sigmoid(self.continue_head(latent.flat())).squeeze(-1)
 
     @torch.no_grad()
-    def set_outputs(self, obs: Tensor, events: Tensor) -> None:
+    def set_outputs(self, obs: Float[Tensor, "T B P *shape"], events: Float[Tensor, "T B PE"]) -> None:
         """Start decoders and event head at the data's means: rare events need not be unlearned first. Centre grids.
 
         Scaled obs (T, B, P, *shape) and events (T, B, P * E) in [0, 1].
@@ -332,5 +354,5 @@ def _last_bias(net: nn.Sequential) -> nn.Parameter:
     return last.bias
 
 
-def _style(config: WorldModelConfig) -> dict[str, Any]:
+def _layer_style(config: WorldModelConfig) -> dict[str, Any]:
     return {"units": config.units, "activation": config.activation, "norm": config.norm}

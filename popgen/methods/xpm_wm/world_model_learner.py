@@ -81,7 +81,7 @@ class ModelLearner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
 
-    def _rate(self) -> float:
+    def _learning_rate(self) -> float:
         return float(self.optimiser.param_groups[0]["lr"])
 
     def add_predecessor(self, member: int, filter_weights: w.Weights) -> None:
@@ -163,7 +163,7 @@ class ModelLearner:
         if not torch.isfinite(loss.detach() + norm):
             bad = [name for name, term in terms.items() if not torch.isfinite(term)] or ["gradient"]
             problem = f"{' and '.join(bad)} not finite in update {self.updates + 1} of the world model"
-            raise FloatingPointError(f"{problem}, at a learning rate of {self._rate():g}")
+            raise FloatingPointError(f"{problem}, at a learning rate of {self._learning_rate():g}")
         self.optimiser.step()
         self.updates += 1
         metrics = {f"loss_{name}": float(term.detach()) for name, term in terms.items()}

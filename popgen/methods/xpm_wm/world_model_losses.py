@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from popgen.methods.xpm_wm.latents import kl_divergence
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+def masked_mean(values: Float[Tensor, "T B"], mask: Float[Tensor, "T B"]) -> Float[Tensor, ""]:
     """Mean of values (T, B) where mask (T, B) is 1; 0 if nowhere."""
     return (values * mask).sum() / mask.sum().clamp(min=1.0)
 
 
-def reconstruction(outputs: Tensor, target: Tensor, *, binary: bool, largest: Tensor | None = None) -> Tensor:
+def reconstruction(
+    outputs: Float[Tensor, "T B *shape"],
+    target: Float[Tensor, "T B *shape"],
+    *,
+    binary: bool,
+    largest: Tensor | None = None,
+) -> Float[Tensor, "T B"]:
     """-ln p(o | h, z), up to a constant. (T, B, ...) -> (T, B).
 
     Args:
@@ -31,12 +38,14 @@ def reconstruction(outputs: Tensor, target: Tensor, *, binary: bool, largest: Te
     return loss.flatten(2).sum(-1)
 
 
-def events(logits: Tensor, target: Tensor) -> Tensor:
+def events(logits: Float[Tensor, "T B PE"], target: Float[Tensor, "T B PE"]) -> Float[Tensor, "T B"]:
     """-ln p(r | h, z) of the binary event vector. (T, B, P * E) -> (T, B)."""
     return F.binary_cross_entropy_with_logits(logits, target, reduction="none").sum(-1)
 
 
-def balanced_kl(posterior: Tensor, prior: Tensor, *, dyn: float, rep: float, free_nats: float) -> tuple[Tensor, Tensor]:
+def balanced_kl(
+    posterior: Float[Tensor, "T B C G"], prior: Float[Tensor, "T B C G"], *, dyn: float, rep: float, free_nats: float
+) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
     """KL balancing with free nats (DreamerV2/V3).
 
         dyn * max(free, KL[sg(q) || p]) + rep * max(free, KL[q || sg(p)])
@@ -53,12 +62,14 @@ def balanced_kl(posterior: Tensor, prior: Tensor, *, dyn: float, rep: float, fre
     return loss, dynamics.detach()
 
 
-def predecessor_kl(posterior: Tensor, predecessor: Tensor) -> Tensor:
+def predecessor_kl(posterior: Float[Tensor, "T B C G"], predecessor: Float[Tensor, "T B C G"]) -> Float[Tensor, "T B"]:
     """KL[q_j(z | h, o) || q_k(z | h, o)] on cross-play data with k (paper, eq. WM+). (T, B, C, G) -> (T, B)."""
     return kl_divergence(posterior, predecessor.detach())
 
 
-def event_counts(logits: Tensor, target: Tensor, mask: Tensor) -> dict[str, Tensor]:
+def event_counts(
+    logits: Float[Tensor, "T B P E"], target: Float[Tensor, "T B P E"], mask: Float[Tensor, "T B"]
+) -> dict[str, Tensor]:
     """True positives, predicted and actual positives per event at threshold 1/2, over the masked steps.
 
     logits, target (T, B, P, E); mask (T, B). Each result (E,). Precision = hits / predicted, recall = hits / actual.

@@ -13,6 +13,7 @@ from popgen.losses.returns import lambda_return
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner, rollout_dtype
 from popgen.methods.xpm_wm.agent_networks import SELF
+from popgen.methods.xpm_wm.agent_targets import sample_losses
 from popgen.methods.xpm_wm.imagination import Imagined
 from popgen.methods.xpm_wm.latents import Latent
 from popgen.methods.xpm_wm.start_states import NEW_SP, NEW_XP, OLD, Starts
@@ -126,7 +127,9 @@ def test_cross_play_moves_the_actor_by_the_lambda_times_the_reinforce_gradient()
     assert scale == pytest.approx(9.0)
     imagined = trajectories(ROWS, lambda a: good_and_bad(own_action(a)) + 5.0, seed=3)
     learner.actor.zero_grad()
-    learner.losses(learner.cross_play(imagined, 1, SEATS, learner.networks.scale.value()).samples).policy.backward()
+    sample_losses(
+        learner.networks, learner.cross_play(imagined, 1, SEATS, learner.networks.scale.value()).samples
+    ).policy.backward()
     got = [parameter.grad.clone() for parameter in learner.actor.parameters()]
     learner.actor.zero_grad()
     # J_XP's gradient: mean of (return - mean return) grad ln pi, in units of the self-play returns' spread;
@@ -195,7 +198,7 @@ def test_each_critic_learns_from_its_own_trajectories_and_the_actor_from_no_valu
     imagined = trajectories(ROWS, lambda a: a[..., 0])
     one = torch.ones(())
     target = learner.self_play(imagined) if key == SELF else learner.cross_play(imagined, key, SEATS, one)
-    actor_loss, critic_loss, _ = learner.losses(target.samples)
+    actor_loss, critic_loss, _ = sample_losses(learner.networks, target.samples)
     critic_loss.backward()
     for name, critic in learner.critics.items():
         for parameter in critic.parameters():
@@ -268,7 +271,7 @@ def test_cross_play_terms_look_at_the_agents_own_seat() -> None:
     imagined = trajectories(ROWS, lambda a: good_and_bad(a[..., 0]), seed=1)
 
     def loss(imagined: Imagined) -> Tensor:
-        return learner.losses(learner.cross_play(imagined, 1, SEATS, torch.ones(())).samples).policy
+        return sample_losses(learner.networks, learner.cross_play(imagined, 1, SEATS, torch.ones(())).samples).policy
 
     before = loss(imagined)
     others = imagined.actions.clone()
@@ -399,7 +402,7 @@ def test_the_first_step_of_ppo_is_that_of_reinforce(key: int) -> None:
         given = trajectories(ROWS, lambda a: (a[..., 0] == 2).float(), seed=3)
         target = learner.self_play(given) if key == 0 else learner.cross_play(given, 1, SEATS, torch.ones(()))
         assert (target.samples.log_prob is None) == (surrogate == "reinforce")
-        learner.losses(target.samples).policy.backward()
+        sample_losses(learner.networks, target.samples).policy.backward()
         gradients.append(torch.cat([parameter.grad.flatten() for parameter in learner.actor.parameters()]))
     torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-4)
     assert gradients[0].abs().max() > 1e-3
