@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import support.checked_shapes  # noqa: F401  (before anything of popgen)
 
 for _name, _value in {
     "RAY_USAGE_STATS_ENABLED": "0",

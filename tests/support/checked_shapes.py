@@ -1,0 +1,21 @@
+"""Shapes in signatures are checked in tests: importing this before popgen makes jaxtyping and beartype look at them."""
+
+from __future__ import annotations
+
+from jaxtyping import install_import_hook
+
+CHECKED = [
+    "popgen.losses",
+    "popgen.nets.sampling",
+    "popgen.nets.two_hot",
+    "popgen.nets.feed_forward",
+    "popgen.play.trajectories",
+    "popgen.methods.xpm_wm.world_model",
+    "popgen.methods.xpm_wm.world_model_losses",
+    "popgen.methods.xpm_wm.latents",
+    "popgen.methods.xpm_wm.agent_networks",
+    "popgen.methods.xpm_wm.agent_targets",
+]
+"""Modules whose public functions name the dimensions of their arrays."""
+
+install_import_hook(CHECKED, "beartype.beartype")
