@@ -23,6 +23,7 @@ from popgen.pipelines.crew import start_ray
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.reports.crossplay_report import to_dict, write_report
+from popgen.reports.method_titles import title_of
 from popgen.reports.run_figures import write_run_figures
 from popgen.runs.directory import RunState
 from popgen.runs.monitoring import LoggingReporter, gauge
@@ -185,8 +186,9 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     size = len(recorder.population)
     episodes = result.episodes * len(result.pairings)
     recorder.record_evaluation(size, result.steps, episodes)
+    title = f"{spec.name}, {title_of(config.method)}, seed {config.run.seed}"
     files |= write_run_figures(
-        recorder.dir, recorder.dir / "report", recorder.member_steps(), unit=spec.score_name, title=spec.name
+        recorder.dir, recorder.dir / "report", recorder.member_steps(), unit=spec.score_name, title=title
     )
     recorder.log_artefacts(files.values())
     figures = {"sp": result.sp.mean, "xp": result.xp.mean}

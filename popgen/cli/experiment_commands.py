@@ -98,7 +98,8 @@ def self_sabotage(args: argparse.Namespace) -> int:
     if args.json:
         print_json(report)
         return OK
-    print_report([sheet.to_rich() for sheet in to_sheets(report)], [*NOTES, *summary(report)], args.out, report["files"])
+    tables = [sheet.to_rich() for sheet in to_sheets(report)]
+    print_report(tables, [*NOTES, *summary(report)], args.out, report["files"])
     return OK
 
 

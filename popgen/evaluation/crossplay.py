@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from popgen.errors import UserError
-from popgen.play.policy import Policy
 from popgen.play.episodes import Episodes
+from popgen.play.policy import Policy
 from popgen.play.rollout import play_teams
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 from popgen.population.manifest import EnvironmentInfo

@@ -45,7 +45,8 @@ def crossplay_heat_map(result: CrossPlayResult, paths: Sequence[str | Path]) -> 
 def _draw_cells(axes: Axes, mean: np.ndarray, error: np.ndarray) -> ScalarMappable:
     colours = matplotlib.colormaps["cividis"]
     low = min(0.0, float(np.nanmin(mean)))
-    high = max(float(np.nanmax(mean)), low + 1e-9)
+    high = float(np.nanmax(mean))
+    high = high if high > low else low + 1.0
     axes.set_facecolor("white")  # shows where nothing was played
     image = axes.imshow(np.ma.masked_invalid(mean), cmap=colours, vmin=low, vmax=high, aspect="auto")
     for (row, column), value in np.ndenumerate(mean):

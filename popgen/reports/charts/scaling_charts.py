@@ -128,8 +128,10 @@ def _draw_band(axes: Axes, band: Band, look: Look, scale: float) -> None:
         axes.fill_between(band.agents, low, high, color=look.colour, alpha=0.2, linewidth=0)
     rest = slice(max(0, last - 1), None)  # the dashed line begins at the last measured point
     axes.plot(band.agents[rest], mean[rest], "--", color=look.colour, linewidth=0.9)
-    axes.plot(band.agents[:last], mean[:last], "-", linewidth=1.4, **style)
-    axes.plot(band.agents[last:], mean[last:], linestyle="none", markerfacecolor="white", zorder=3, **style)
+    if last:  # an empty line that is not clipped would count in the layout
+        axes.plot(band.agents[:last], mean[:last], "-", linewidth=1.4, **style)
+    if last < len(mean):
+        axes.plot(band.agents[last:], mean[last:], linestyle="none", markerfacecolor="white", zorder=3, **style)
 
 
 def _draw_arrows(axes: Axes, band: Band, colour: str, scale: float) -> None:
