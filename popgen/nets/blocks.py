@@ -99,6 +99,7 @@ class ConvEncoder(nn.Module):
         self.features = channels * width * height
 
     def forward(self, grid: Tensor) -> Tensor:
+        """(B, W, H, K) -> (B, features)."""
         return self.layers(grid.permute(0, 3, 1, 2)).flatten(1)
 
 
@@ -133,5 +134,6 @@ class ConvDecoder(nn.Module):
         self.bias = nn.Parameter(torch.zeros(self.width, self.height, planes))
 
     def forward(self, features: Tensor) -> Tensor:
+        """(B, inputs) -> (B, W, H, K)."""
         grid = self.expand(features).unflatten(-1, (self.channels, self.width, self.height))
         return self.layers(grid).permute(0, 2, 3, 1) + self.bias

@@ -226,12 +226,12 @@ class Replay:
             chosen=np.zeros(len(starts), bool) if chosen is None else chosen,
         )
 
-    def _columns(self) -> dict[str, np.ndarray]:
+    def _stored_columns(self) -> dict[str, np.ndarray]:
         return {name: getattr(self, name) for name in self.COLUMNS}
 
     def state(self) -> dict[str, Any]:
         """Everything needed to continue: arrays of the filled part, counters and the generator (JSON-able)."""
-        arrays = {name: column[: self.size].copy() for name, column in self._columns().items()}
+        arrays = {name: column[: self.size].copy() for name, column in self._stored_columns().items()}
         counters = {
             "head": self.head,
             "streams": self.streams,
@@ -250,7 +250,7 @@ class Replay:
         if len(arrays["stream"]) > self.capacity:
             raise ValueError(f"{len(arrays['stream'])} rows do not fit a replay of {self.capacity}")
         self.size = len(arrays["stream"])
-        for name, column in self._columns().items():
+        for name, column in self._stored_columns().items():
             column[: self.size] = arrays[name]
         self.head, self.streams, self.added = (int(counters[name]) for name in ("head", "streams", "added"))
         self.rng.bit_generator.state = counters["rng"]

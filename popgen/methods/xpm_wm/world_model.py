@@ -68,6 +68,7 @@ class JointEncoder(nn.Module):
         self.trunk = mlp(inputs, None, **_layer_style(config), layers=config.encoder_layers)
 
     def forward(self, obs: Tensor) -> Tensor:
+        """(B, P, *shape) -> (B, units)."""
         if self.conv is None:
             return self.trunk(obs.flatten(1))
         obs = obs - self.center
@@ -101,6 +102,7 @@ class PlayerDecoder(nn.Module):
         return _last_bias(self.trunk) if self.conv is None else self.conv.bias
 
     def forward(self, inputs: Tensor) -> Tensor:
+        """(B, D + C * G) -> (B, *shape)."""
         hidden = self.trunk(inputs)
         return hidden if self.conv is None else self.conv(hidden)
 
