@@ -21,6 +21,22 @@ for _name, _value in {
     os.environ.setdefault(_name, _value)
 
 ROOT = Path(__file__).resolve().parent.parent
+WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too."""
+    for item in items:
+        if needs_ray(item):
+            item.add_marker(pytest.mark.ray)
+        group = "ray" if item.get_closest_marker("ray") else item.path.relative_to(ROOT).as_posix()
+        item.add_marker(pytest.mark.xdist_group(group))
+
+
+def needs_ray(item: pytest.Item) -> bool:
+    """Whether a test uses a Ray of its module, or stands in a file that imports Ray or starts clusters."""
+    assert isinstance(item, pytest.Function)
+    return "cluster" in item.fixturenames or hasattr(item.module, "ray") or item.path.name in WITH_RAY
 
 
 @pytest.fixture(scope="session")
