@@ -4,55 +4,63 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.config.run_config import RunConfig
+from popgen.methods.training import Pending, Segments, State
+from popgen.methods.transport import Transport
 from popgen.methods.xpm_sim.agent import XpmSimLearner
 from popgen.methods.xpm_sim.restart_check import restart_check
+from popgen.methods.xpm_sim.workers import Learned, RestartCheck
 from popgen.nets.weights import Weights, weights_of
-from popgen.types import Segment
 
 ENVS = 64
 """Environments from which start states are drawn at once."""
 
 
-@dataclass(frozen=True)
-class Learned:
-    """What a call of `train` gave: acting weights, mean figures, simulated steps and trajectories of the call."""
-
-    acting: Weights
-    metrics: dict[str, float]
-    steps: int
-    trajectories: int
-
-
-class ExactLearnerActor:
+class SimulatedAgentActor:
     """Thin: every number is made by `XpmSimLearner`."""
 
-    def __init__(self, config: RunConfig, threads: int) -> None:
+    def __init__(self, config: RunConfig, threads: int, transport: Transport) -> None:
         limit_threads(threads)
-        self.config = config
+        self.config, self.transport = config, transport
         self.env = build_env(config.env, ENVS, config.run.seed)
+        self._learner: XpmSimLearner | None = None
+
+    @property
+    def learner(self) -> XpmSimLearner:
+        """The running member's.
+
+        Raises:
+            RuntimeError: no member has begun.
+        """
+        if self._learner is None:
+            raise RuntimeError("begin_member comes first")
+        return self._learner
 
     def begin_member(
-        self, member: int, seed: int, partners: dict[int, Weights], encoder: dict[str, Any] | None
+        self, member: int, seed: int, partners: Mapping[int, Pending[Weights]], encoder: Pending[State | None] | None
     ) -> Weights:
         """Fresh networks and buffers beside frozen predecessors (weights by member), on the shared encoder if there is
         one; the fresh acting weights."""
         self.env.reset(seed=seed)
-        self.learner = XpmSimLearner(self.config.xpm_sim, self.env, member, seed, partners, encoder)
-        return self.learner.actor.weights()
+        frozen = {partner: weights.result() for partner, weights in partners.items()}
+        shared = None if encoder is None else encoder.result()
+        self._learner = XpmSimLearner(self.config.xpm_sim, self.env, member, seed, frozen, shared)
+        return self._learner.actor.weights()
 
-    def add(self, segments: list[Segment], partner_scores: dict[int, float]) -> None:
+    def ingest(self, segments: list[Segments], strength: dict[int, float]) -> None:
         """Real episodes into the buffers, and each partner's latest cross-play return."""
-        self.learner.starts.add(segments)
-        self.learner.partner_scores = dict(partner_scores)
+        for by_kind in segments:
+            for part in by_kind.values():
+                self.learner.starts.add(part.result())
+        self.learner.partner_scores = dict(strength)
 
-    def train(self, updates: int) -> Learned:
+    def learn(self, updates: int) -> Learned:
         """Simulate and update `updates` times."""
         began, cpu, learner = time.perf_counter(), time.process_time(), self.learner
         steps, trajectories = learner.simulated, learner.trajectories
@@ -63,13 +71,14 @@ class ExactLearnerActor:
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["update_ms"] = 1e3 * (time.perf_counter() - began) / updates
         means["cpu_seconds"] = time.process_time() - cpu
-        return Learned(learner.actor.weights(), means, learner.simulated - steps, learner.trajectories - trajectories)
+        acting = self.transport.put(learner.actor.weights())
+        return Learned(acting, means, learner.simulated - steps, learner.trajectories - trajectories)
 
-    def check(self) -> tuple[dict[str, float], int]:
+    def check(self) -> RestartCheck:
         """See `restart_check`."""
-        return restart_check(self.learner, self.config.xpm_sim.check_pairs)
+        return RestartCheck(*restart_check(self.learner, self.config.xpm_sim.check_pairs))
 
-    def encoder(self) -> dict[str, Any] | None:
+    def encoder(self) -> State | None:
         """The shared encoder for the next member, None without one."""
         return None if self.learner.encoder is None else self.learner.encoder.state()
 
@@ -81,6 +90,6 @@ class ExactLearnerActor:
         """Of the learner, its buffers and running trajectories."""
         return self.learner.state()
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`, after `begin_member` with the same partners."""
-        self.learner.load_state(state)
+    def load_state(self, state: Pending[State]) -> None:
+        """Continue from `state()`, after `begin_member` with the same partners."""
+        self.learner.load_state(state.result())

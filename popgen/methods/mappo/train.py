@@ -1,0 +1,235 @@
+"""The baselines' training loop on RLlib (paper, section 2.2): MAPPO self-play, LIPO and CoMeDi.
+
+    for every group of members that learn together (LIPO: all; MAPPO and CoMeDi: one after the other):
+        until the budget is used up or the targets are reached:
+            choose each member's partner, sample, update     (one `train()` of `popgen.methods.mappo.algorithm.Mappo`)
+        add them to the archive
+
+What is sampled, and how it enters the objective: `lipo.py`, `comedi.py`. RLlib holds the runners and the learner, and
+gives no more than this loop over its iterations.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+
+import torch
+
+from popgen.config.run_config import RunConfig
+from popgen.config.sections import ClusterConfig
+from popgen.envs.contract import EnvSpec
+from popgen.errors import UserError
+from popgen.methods.mappo.algorithm import Mappo, MappoConfig
+from popgen.methods.mappo.objective import Objective
+from popgen.methods.mappo.training_job import Job, policy_config
+from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
+from popgen.nets.weights import Weights, prefixed
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.types import Kind
+
+SCORES = ("sp", "xp")
+"""Figures of whole episodes, `real_...` in the metrics; an iteration lacks them until some have ended."""
+
+
+@dataclass
+class GroupProgress:
+    """How far the training of the members that learn together has come.
+
+    Attributes:
+        sequence: number of the next step count, over all members of the run.
+        seconds: that the training took before this attempt.
+        steps: member -> its environment steps.
+    """
+
+    sequence: int = 0
+    seconds: float = 0.0
+    steps: dict[int, int] = field(default_factory=dict)
+
+    @staticmethod
+    def from_state(state: State) -> GroupProgress:
+        """Of a checkpoint."""
+        steps = {int(member): int(count) for member, count in state["steps"].items()}
+        return GroupProgress(int(state["sequence"]), float(state["seconds"]), steps)
+
+
+def learning_members(objective: Objective, config: RunConfig, first: int) -> tuple[int, ...]:
+    """The members that learn together with `first`."""
+    together = objective.meets_partners and config.diversity.order == "concurrent"
+    return tuple(range(1, config.population.size + 1)) if together else (first,)
+
+
+def training_job(
+    objective: Objective, config: RunConfig, learning: tuple[int, ...], archive: Mapping[int, Weights]
+) -> Job:
+    """What RLlib is to train; `archive` holds the weights of the members that are finished."""
+    meets, first = objective.meets_partners, learning[0]
+    return Job(
+        env=config.env,
+        ppo=config.ppo,
+        diversity=config.diversity if meets else None,
+        learning=learning,
+        seed=config.run.seed * 1000 + first,
+        frozen={member: archive[member] for member in range(1, first)} if meets else {},
+        mixed=objective.samples(Kind.MP, config.diversity),
+        fresh=objective.fresh_episodes,
+    )
+
+
+def check_card(cluster: ClusterConfig) -> None:
+    """A learner that asks for a GPU finds one in this process.
+
+    Raises:
+        UserError: there is none.
+    """
+    if cluster.agent_gpus > 0.0 and not torch.cuda.is_available():
+        problem = f"{cluster.agent_gpus:g}, but the driver, in whose process the baselines learn, sees no GPU"
+        raise UserError("cluster.agent_gpus", problem, "set it to 0, or start the driver where there is one")
+
+
+class RllibTraining:
+    """The training of one run's members in one attempt (`popgen.methods.training.Training`)."""
+
+    learners = ("ppo", *(f"real_{name}" for name in SCORES))
+    log_rows = 1  # no log: there are no buffers
+    begins_workers = True  # RLlib starts its runners with every group of members
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, attempt: str, objective: Objective) -> None:
+        self.config, self.spec, self.attempt, self.objective = config, spec, attempt, objective
+        self.archive: dict[int, Weights] = {}
+        self.learning: tuple[int, ...] = ()
+        self.progress = GroupProgress()
+        self.began = time.time()
+        self._algorithm: Mappo | None = None
+
+    @property
+    def algorithm(self) -> Mappo:
+        """Of the members that learn.
+
+        Raises:
+            RuntimeError: none have begun.
+        """
+        if self._algorithm is None:
+            raise RuntimeError("begin comes first")
+        return self._algorithm
+
+    def train(self) -> Loop:
+        """Iterations, to the end of all members that learn together."""
+        first, last, algorithm = self.learning[0], self.learning[-1], self.algorithm
+        names = f"member {first}" + (f" to {last}" if last > first else "")
+        yield Phase(f"{names}: {self.config.method}", 1.0)
+        if algorithm.rounds:
+            steps = self.progress.steps[first]
+            yield Progress(first, steps, note=f"continuing after {algorithm.rounds} iterations of {names}")
+        while not algorithm.finished:
+            algorithm.train()
+            yield from self._report_iteration()
+            yield self._end_round()
+        for member in self.learning:
+            yield self._finish_member(member)
+        self.close()
+
+    def _report_iteration(self) -> Loop:
+        """An iteration's step counts, then each member's figures."""
+        report, ppo, now = self.algorithm.report, self.config.ppo, self.progress
+        counts = []
+        for number, one in enumerate(report.counted, now.sequence):
+            name = f"runner{one.runner}.{self.attempt}"
+            counts.append(StepCount(one.owner, one.kind, name, number, one.steps, one.episodes, one.score))
+            now.steps[one.owner] += one.steps
+        now.sequence += len(counts)
+        first = self.learning[0]
+        yield Progress(first, now.steps[first], counted=tuple(counts))
+        for runner in report.lost:
+            text = f"runner {runner} was lost: its environments are missing until Ray has restarted it"
+            yield Progress(first, now.steps[first], note=text)
+        update_ms = 1000.0 * report.seconds["learning"] / (ppo.epochs * ppo.minibatches)
+        for member in self.learning:
+            figures = report.figures[member]
+            shown = {f"real_{name}" if name in SCORES else f"ppo/{name}": value for name, value in figures.items()}
+            shown |= {"ppo/update_ms": update_ms, "iteration": self.algorithm.rounds}
+            yield Progress(member, now.steps[member], shown)
+
+    def _end_round(self) -> Round:
+        """The last iteration is kept in any case: members are added one after the other, which may be interrupted."""
+        algorithm, steps = self.algorithm, self.progress.steps
+        scores = [algorithm.scores(member) for member in self.learning]
+        by_name = {name.upper(): [score[name] for score in scores if name in score] for name in SCORES}
+        means = {name: round(sum(values) / len(values), 2) for name, values in by_name.items() if values}
+        return Round(
+            self.learning[-1],
+            steps[self.learning[-1]],
+            done=min(1.0, algorithm.progress),
+            shown={"steps": sum(steps.values()), **means},
+            number=algorithm.rounds,
+            must_save=algorithm.finished,
+        )
+
+    def _finish_member(self, member: int) -> TrainedMember:
+        """The actor as it is saved, its critics beside it."""
+        algorithm, seconds = self.algorithm, self._seconds()
+        policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), algorithm.actors()[member], self.spec)
+        self.archive[member] = policy.weights()
+        scores = algorithm.scores(member)
+        extra = {**scores, "iterations": algorithm.rounds, "seconds": round(seconds / len(self.learning), 1)}
+        parts = ", ".join(f"{name.upper()} {value:.2f}" for name, value in scores.items())
+        steps = f"{self.progress.steps[member]:,} environment steps"
+        return TrainedMember(
+            member,
+            policy,
+            prefixed("critics", algorithm.critics(member)),
+            seed=self.config.run.seed * 1000 + member,
+            extra=extra,
+            left={"sequence": self.progress.sequence},
+            note=f"member {member}: {parts} {self.spec.score_name} in training, {steps}, {seconds / 60:.1f} min",
+        )
+
+    def _seconds(self) -> float:
+        return self.progress.seconds + time.time() - self.began
+
+    # ---- members and checkpoints ---------------------------------------------------------------------------------
+
+    def adopt(self, weights: dict[int, Weights], left: State) -> None:
+        """See `Training`."""
+        self.archive = dict(weights)
+        self.progress.sequence = int(left.get("sequence", 0))
+
+    def first_of_group(self, member: int) -> int:
+        """See `Training`."""
+        return learning_members(self.objective, self.config, member)[0]
+
+    def begin(self, first: int) -> tuple[int, ...]:
+        """Start RLlib's learner and runners.
+
+        Raises:
+            UserError: the card that the recipe asks for is not there.
+        """
+        check_card(self.config.cluster)
+        self.learning = learning_members(self.objective, self.config, first)
+        self.progress = GroupProgress(self.progress.sequence, steps=dict.fromkeys(self.learning, 0))
+        job = training_job(self.objective, self.config, self.learning, self.archive)
+        self._algorithm = MappoConfig.of(job, self.spec, self.config.cluster).build_algo()
+        self.began = time.time()
+        return self.learning
+
+    def checkpoint(self) -> State:
+        """See `Training`."""
+        progress = asdict(self.progress) | {"seconds": self._seconds()}
+        progress["steps"] = {str(member): steps for member, steps in self.progress.steps.items()}
+        return {"algorithm": self.algorithm.snapshot(), "progress": progress}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """See `Training`."""
+        self.algorithm.resume(checkpoint.state["algorithm"])
+        self.progress = GroupProgress.from_state(checkpoint.state["progress"])
+
+    def buffers(self) -> State:
+        """There are none."""
+        return {}
+
+    def close(self) -> None:
+        """End RLlib's workers."""
+        if self._algorithm is not None:
+            self._algorithm.stop()
+            self._algorithm = None
