@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, cast
 
 import ray
 
@@ -38,7 +38,7 @@ def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
     try:
         check_card(config.cluster)
         wait_for_room(config, lambda text: None)
-        algorithm = MappoConfig.of(job, spec, config.cluster).build_algo()
+        algorithm = cast(Mappo, MappoConfig.of(job, spec, config.cluster).build_algo())
         try:
             measured = _train(algorithm, seconds)
         finally:

@@ -39,6 +39,7 @@ class Plane(Protocol):
 
     def positions(self, states: np.ndarray) -> np.ndarray:
         """Where the players are, (..., P, 2), in states (..., S)."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -130,8 +130,8 @@ def _final_score(records: Sequence[RunRecord]) -> float:
 
 def curves_csv(report: Mapping[str, Any]) -> str:
     """A row per curve and grid point: curve, simulated_steps, mean, deviation."""
-    columns = ("curve", "simulated_steps", "mean", "deviation")
-    rows = [
+    columns: tuple[str, ...] = ("curve", "simulated_steps", "mean", "deviation")
+    rows: list[dict[str, Any]] = [
         dict(zip(columns, (curve["name"], round(step), mean, spread), strict=True))
         for curve in report["curves"]
         for step, mean, spread in zip(curve["steps"], curve["mean"], curve["deviation"], strict=True)

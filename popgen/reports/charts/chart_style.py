@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from popgen.reports.frames import steps_text
 
@@ -32,7 +33,7 @@ MARKERS = "<>hpdosD^v"
 GREY = "#444444"
 """Of legend entries that stand for every colour."""
 
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.labelsize": 8,
@@ -65,10 +66,11 @@ class Pictures:
 
 
 @contextmanager
-def styled_figure(paths: Sequence[str | Path], width: float, height: float) -> Iterator[Figure]:
-    """A styled figure that is saved to `paths` (by suffix) on leaving; needs no display."""
+def styled_figure(paths: Sequence[str | Path], width: float, height: float, *, dense: bool = False) -> Iterator[Figure]:
+    """A styled figure that is saved to `paths` (by suffix) on leaving; needs no display. `dense` panels touch."""
+    engine = ConstrainedLayoutEngine(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.0) if dense else "constrained"
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height), layout=engine)
         FigureCanvasAgg(figure)
         yield figure
         for path in paths:

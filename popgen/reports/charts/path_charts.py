@@ -41,8 +41,7 @@ def path_grid(paths: Paths, files: Sequence[str | Path], *, title: str) -> None:
     """
     size = min(len(paths.positions), _DRAWN)
     side = max(COLUMN, min(PAGE, 0.85 * size + 0.2))
-    with styled_figure(files, side, side + 0.3 + legend_height(_path_handles(), side)) as figure:
-        figure.get_layout_engine().set(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.0)
+    with styled_figure(files, side, side + 0.3 + legend_height(_path_handles(), side), dense=True) as figure:
         grid = figure.subplots(size, size, squeeze=False)
         for (row, column), axes in np.ndenumerate(grid):
             _draw_paths(axes, paths, row, column, small=True)
@@ -84,7 +83,10 @@ def path_samples(samples: Sequence[PathSample], files: Sequence[str | Path]) -> 
 def _draw_paths(axes: Axes, paths: Paths, row: int, column: int, *, small: bool) -> None:
     """Bounds (shaded where one left), landmarks, both ways from their starts (dots); a cross where one left."""
     edge, size = paths.bounds, 1.0 if small else 2.0
-    look = {"facecolor": "#EEEEEE" if paths.left[row, column].any() else "white", "edgecolor": "#888888"}
+    look: dict[str, Any] = {
+        "facecolor": "#EEEEEE" if paths.left[row, column].any() else "white",
+        "edgecolor": "#888888",
+    }
     axes.add_patch(Rectangle((-edge, -edge), 2 * edge, 2 * edge, linewidth=0.6, zorder=0, **look))
     axes.plot(*paths.landmarks.T, "s", color="#999999", markersize=2.2 * size, markeredgewidth=0)
     for seat, (colour, line) in enumerate(zip(SEAT_COLOURS, ("-", (0, (3, 1))), strict=True)):

@@ -86,7 +86,7 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
 
 def _describe_run(group: Group, run: RunRecord) -> dict[str, Any]:
     steps = {kind: sum(m.steps.get(kind, 0) for m in run.members) for kind in KINDS}
-    times = [m.seconds for m in run.members]
+    times = [m.seconds for m in run.members if m.seconds is not None]
     return {
         "label": group.label,
         "method": group.method,
@@ -104,7 +104,7 @@ def _describe_run(group: Group, run: RunRecord) -> dict[str, Any]:
         "simulated_steps": steps[str(Kind.SIMULATED)],
         "evaluation_steps": run.evaluation_steps,
         "lost_steps": run.lost_steps,
-        "seconds": None if None in times else round(sum(times), 1),
+        "seconds": round(sum(times), 1) if len(times) == len(run.members) else None,
     }
 
 
@@ -153,14 +153,16 @@ def _describe_quality(comparison: Comparison) -> dict[str, Any]:
     members, agents = [], []
     for group in comparison.groups:
         limits = comparison.thresholds.get(group.environment)
-        for run in group.runs if limits else ():
+        if limits is None:
+            continue
+        for run in group.runs:
             head = {"label": group.label, "environment": group.environment, "seed": run.seed, "run": run.run_id}
             for one in (quality(member, limits) for member in run.members):
                 members.append(head | asdict(one))
             for many in quality_costs(run, limits):
                 agents.append(head | asdict(many) | {"lower_bound": many.bound})
-    limits = {name: comparison.thresholds.get(name) for name in comparison.environments}
-    thresholds = {name: None if limit is None else {"sp": limit.sp, "xp": limit.xp} for name, limit in limits.items()}
+    chosen = {name: comparison.thresholds.get(name) for name in comparison.environments}
+    thresholds = {name: None if limit is None else {"sp": limit.sp, "xp": limit.xp} for name, limit in chosen.items()}
     return {"thresholds": thresholds, "members": members, "agents": agents}
 
 
