@@ -209,10 +209,9 @@ def evaluate_population(
     if episodes < 1:
         raise UserError("evaluation.episodes", f"must be at least 1, got {episodes}")
     spec = population.spec
-    labels = [str(member) for member in chosen] + list(PARTNERS)
+    labels, count = [*map(str, chosen), *PARTNERS], len(chosen)
     policies: list[Policy] = [population[member] for member in chosen]
     policies += [RandomPolicy(spec.num_actions), IdlePolicy(spec.action_names)]
-    count = len(chosen)
     # All pairs but those of the two partners among themselves.
     matches = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
     played = play_teams(
