@@ -124,7 +124,7 @@ def interquartile_mean(scores: np.ndarray) -> float:
     """Mean of the middle half of all scores, in any shape."""
     from scipy.stats import trim_mean
 
-    return float(trim_mean(np.asarray(scores, np.float64), proportiontocut=0.25, axis=None))
+    return float(trim_mean(np.asarray(scores, np.float64).ravel(), proportiontocut=0.25))
 
 
 def bootstrap_interval(
