@@ -10,63 +10,62 @@ import numpy as np
 
 from popgen.actors.actor_setup import build_env, device_of, limit_threads
 from popgen.config.run_config import RunConfig
+from popgen.methods.transport import Transport
 from popgen.methods.xpm_wm.agent import AgentLearner
-from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.member_progress import MemberWeights
+from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate
 from popgen.nets.weights import Weights, prefixed, under, weights_of
 
 
 class AgentActor:
     """Thin: every number is made by `AgentLearner`."""
 
-    def __init__(self, config: RunConfig, threads: int) -> None:
+    def __init__(self, config: RunConfig, threads: int, transport: Transport) -> None:
         limit_threads(threads)
-        self.config = config
+        self.config, self.transport = config, transport
         self.spec = build_env(config.env, 1).spec
-        self.model: Weights = {}
+        self.learner = self._fresh_learner(1, 0)
+
+    def _fresh_learner(self, member: int, seed: int) -> AgentLearner:
+        config, device = self.config, device_of(self.config.cluster.agent_gpus)
+        return AgentLearner(config.agent, config.world_model, self.spec, member, seed, device)
 
     def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
-        """A fresh actor and critics beside frozen predecessors (actor weights by member)."""
-        config, device = self.config, device_of(self.config.cluster.agent_gpus)
-        self.learner = AgentLearner(config.agent, config.world_model, self.spec, member, seed, device)
+        """A fresh actor and critics beside frozen predecessors (acting weights by member)."""
+        self.learner = self._fresh_learner(member, seed)
         for partner, weights in partners.items():
-            self.learner.add_partner(partner, weights)
+            self.learner.add_partner(partner, under("actor", weights))
 
     def restart(self, seed: int) -> None:
         """Fresh actor and critics on the same world model."""
         self.learner.restart(seed)
 
-    def train(
-        self,
-        updates: int,
-        model: Weights,
-        starts: Starts,
-        new_share: float,
-        partner_scores: dict[int, float],
-        plays: bool,
-    ) -> tuple[Weights, Weights, dict[str, float]]:
-        """Imagine and update `updates` times; acting weights (filter and actor), critics and mean metrics."""
+    def train(self, task: AgentTask) -> AgentUpdate:
+        """Imagine and update; what comes of it stays in the store."""
         began, began_cpu = time.perf_counter(), time.process_time()
+        model = task.model.result()
         self.learner.set_model(model)
-        self.learner.set_starts(starts, new_share)
-        self.learner.partner_scores, self.learner.plays = dict(partner_scores), plays
+        self.learner.set_starts(task.starts.result(), task.new_share)
+        self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
         totals: dict[str, list[float]] = defaultdict(list)
-        for _ in range(updates):
+        for _ in range(task.updates):
             for name, value in self.learner.update().items():
                 totals[name].append(value)
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["seconds"] = time.perf_counter() - began
         means["cpu_seconds"] = time.process_time() - began_cpu
-        means["update_ms"] = 1000.0 * means["seconds"] / updates
-        return self.acting_weights(model), weights_of(self.learner.critics), means
+        means["update_ms"] = 1000.0 * means["seconds"] / task.updates
+        acting, critics = self.acting_weights(model), weights_of(self.learner.critics)
+        return AgentUpdate(MemberWeights(self.transport.put(acting), self.transport.put(critics), task.model), means)
 
     def acting_weights(self, model: Weights) -> Weights:
         """Policy weights: the filter of `model` and this member's actor."""
         return prefixed("filter", under("filter", model)) | prefixed("actor", self.learner.actor_weights())
 
     def state(self) -> dict[str, Any]:
-        """Of the learner: everything but the world model and the start states, which come with every call."""
+        """Of the learner: everything but the world model and the start states, which come with every task."""
         return self.learner.state()
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`, after `begin_member` with the same partners."""
+        """Continue from `state()`, after `begin_member` with the same partners."""
         self.learner.load_state(state)

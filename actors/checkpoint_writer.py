@@ -12,7 +12,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from popgen.methods.training import Checkpoint, Pending, Segments, State
+from popgen.methods.training import Checkpoint, Segments, State
 from popgen.methods.transport import InlineTransport, Place, Transport, Worker
 from popgen.runs.checkpoints import Checkpoints, finished_member, member_folder
 from popgen.runs.state_files import save_state

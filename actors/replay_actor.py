@@ -6,6 +6,7 @@ from typing import Any
 
 from popgen.actors.actor_setup import build_env
 from popgen.config.sections import EnvConfig
+from popgen.methods.training import Pending
 from popgen.methods.xpm_wm.replay import Replay, Windows
 from popgen.methods.xpm_wm.window_requests import Request, draw
 from popgen.types import Segment
@@ -19,11 +20,11 @@ class ReplayActor:
         self.seen: set[tuple[str, int]] = set()
         self.turn = 0
 
-    def add(self, segments: list[Segment], owner: int, kinds: tuple[str, ...]) -> int:
-        """Store the segments whose kind this buffer keeps; a retried call adds nothing. Returns the rows held."""
-        for segment in segments:
+    def ingest(self, segments: Pending[list[Segment]], owner: int) -> int:
+        """Store segments; a retried call adds nothing. Returns the rows held."""
+        for segment in segments.result():
             key = (segment.sampler, segment.sequence)
-            if segment.kind in kinds and key not in self.seen:
+            if key not in self.seen:
                 self.seen.add(key)
                 self.replay.add(segment, owner)
         return self.replay.size
@@ -49,8 +50,9 @@ class ReplayActor:
         self.replay.rng.bit_generator.state = marks["rng"]
         self.turn = int(marks["turn"])
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from `state()`."""
-        self.replay.load_state(state["replay"])
-        self.seen = {(str(name), int(number)) for name, number in state["seen"]}
-        self.turn = int(state["turn"])
+    def load_state(self, state: Pending[dict[str, Any]]) -> None:
+        """Continue from `state()`."""
+        contents = state.result()
+        self.replay.load_state(contents["replay"])
+        self.seen = {(str(name), int(number)) for name, number in contents["seen"]}
+        self.turn = int(contents["turn"])

@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,13 @@ from typing import Any
 import ray
 
 from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.actors.local_ray import start_ray
+from popgen.actors.ray_transport import RayTransport
 from popgen.config.run_config import RunConfig
-from popgen.pipelines.crew import start_ray
-from popgen.pipelines.first_member import LEARNERS, FirstMember
-from popgen.pipelines.xpm_wm_driver import XpmWm
+from popgen.methods.training import Round, Work
+from popgen.methods.xpm_wm.train import LEARNERS
+from popgen.pipelines.population import open_checkpoints, open_training
+from popgen.pipelines.training_driver import TrainingDriver
 from popgen.progress import NullReporter
 from popgen.runs.recorder import RunRecorder
 
@@ -32,7 +35,7 @@ NETWORK = 1.0e9
 ASSUMPTIONS = (
     "each sampler and each learner has a processor core of its own, as fast as one here",
     f"segments of all samplers reach the replays' node at {NETWORK / 1e9:g} GB/s; weights are small beside them",
-    "a round of a sampler costs what it costs here; one driver takes all segments in, one after the other",
+    "a round of a sampler costs what it costs here; one driver takes all counts in, one after the other",
     "samplers wait for the slowest learner (at most one round ahead), learners do not wait for each other",
 )
 
@@ -41,7 +44,7 @@ ASSUMPTIONS = (
 class Costs:
     """Of one round, in seconds of processor time (bytes for `data`): of one sampler's, of each learner's.
 
-    steps: environment steps of one sampler in a round; sampler; driver: taking one sampler's round in; model, agent;
+    steps: environment steps of one sampler in a round; sampler; driver: its share of one sampler's round; model, agent;
     data: bytes of one sampler's segments.
     """
 
@@ -63,44 +66,77 @@ class Costs:
         return {"steps_per_second": samplers * self.steps / passed, **idle}
 
 
-class Timed(FirstMember):
-    """Member 1's rounds for a given time, the first few rounds not counted."""
+WARM = 2
+"""Rounds that are not counted."""
 
-    WARM = 2
 
-    def measure(self, seconds: float) -> dict[str, Any]:
-        """Rounds, steps and processor time since the warm-up."""
-        self.seconds, self.mark, self.driver_cpu = seconds, None, 0.0
-        self.train(None)
-        assert self.mark is not None
-        began, rounds, steps, cpu, busy, driver_cpu, done = self.mark
-        passed = time.perf_counter() - began
-        return {
-            "seconds": passed,
-            "rounds": self.rounds - rounds,
-            "steps": self.driver.steps - steps,
-            "cpu": {name: self.cpu[name] - cpu[name] for name in self.cpu},
-            "driver_cpu": self.driver_cpu - driver_cpu,
-            "idle": {name: max(0.0, 1.0 - (self.busy[name] - busy[name]) / passed) for name in LEARNERS},
-            "done": {name: count - done[name] for name, count in self.pace.done.items()},
-        }
+@dataclass(frozen=True)
+class Moment:
+    """How far the rounds have come: time, rounds, environment steps, the driver's processor time, and the work of each
+    kind."""
 
-    def _sampled(self, result: Any) -> None:
-        began = time.process_time()
-        super()._sampled(result)
-        self.driver_cpu += time.process_time() - began
+    clock: float
+    rounds: int
+    steps: int
+    driver_cpu: float
+    work: Mapping[str, Work]
 
-    def _after(self) -> None:
-        super()._after()
-        if self.rounds == self.WARM:
-            spent = (self.cpu.copy(), self.busy.copy(), self.driver_cpu, dict(self.pace.done))
-            self.mark = (time.perf_counter(), self.rounds, self.driver.steps, *spent)
+    @staticmethod
+    def after(record: Round) -> Moment:
+        """Now, `record` having just ended."""
+        return Moment(time.perf_counter(), record.number, record.steps, time.process_time(), record.work)
 
-    def _stop(self) -> bool:
-        return self.mark is not None and time.perf_counter() - self.mark[0] >= self.seconds
 
-    def _save(self) -> None:
-        """What is measured are the rounds."""
+@dataclass(frozen=True)
+class Measured:
+    """What went on between two moments."""
+
+    first: Moment
+    last: Moment
+
+    @property
+    def seconds(self) -> float:
+        """Between them."""
+        return self.last.clock - self.first.clock
+
+    @property
+    def steps(self) -> int:
+        """Environment steps."""
+        return self.last.steps - self.first.steps
+
+    def work(self, kind: str) -> Work:
+        """Of one kind: a learner, or the sum of all samplers."""
+        total = Work()
+        for name, last in self.last.work.items():
+            if name == kind or (kind == "sampler" and name not in LEARNERS):
+                first = self.first.work[name]
+                total = Work(
+                    total.tasks + last.tasks - first.tasks,
+                    total.seconds + last.seconds - first.seconds,
+                    total.cpu_seconds + last.cpu_seconds - first.cpu_seconds,
+                )
+        return total
+
+    def idle(self) -> dict[str, float]:
+        """Share of the time in which each learner was not at work."""
+        return {name: max(0.0, 1.0 - self.work(name).seconds / self.seconds) for name in LEARNERS}
+
+
+def measure_rounds(driver: TrainingDriver, seconds: float) -> Measured:
+    """Member 1's rounds for a given time, the first few not counted."""
+    driver.checkpoints.begin(None)
+    driver.running = driver.training.begin(1)
+    loop, first = driver.training.train(), None
+    for record in loop:
+        driver.take_in(record)
+        if not isinstance(record, Round) or record.number < WARM:
+            continue
+        if first is None:
+            first = Moment.after(record)
+        elif (now := Moment.after(record)).clock - first.clock >= seconds:
+            loop.close()
+            return Measured(first, now)
+    raise RuntimeError("the rounds ended by themselves")
 
 
 def bench_scale(
@@ -129,11 +165,10 @@ def bench_scale(
     try:
         for count in samplers:
             tell(f"{count} samplers of {config.phase1.envs} environments for {seconds:g} s")
-            seen, data = _measure(_config(config, count), seconds)
-            costs = costs or _costs(seen, data)
-            told = costs.predict(count, overlap, cores)["steps_per_second"]
-            row = {"samplers": count, "steps_per_second": seen["steps"] / seen["seconds"], "idle": seen["idle"]}
-            rows.append(row | {"rounds": seen["rounds"], "seconds": seen["seconds"], "model_steps_per_second": told})
+            measured, data = _measure_once(_endless_config(config, count), seconds)
+            costs = costs or costs_of(measured, data)
+            predicted = costs.predict(count, overlap, cores)["steps_per_second"]
+            rows.append(_row_of(count, measured, predicted))
     finally:
         if mine:
             ray.shutdown()
@@ -149,49 +184,60 @@ def bench_scale(
     }
 
 
-def _config(config: RunConfig, samplers: int) -> RunConfig:
+def _row_of(samplers: int, measured: Measured, predicted: float) -> dict[str, Any]:
+    return {
+        "samplers": samplers,
+        "steps_per_second": measured.steps / measured.seconds,
+        "idle": measured.idle(),
+        "rounds": measured.last.rounds - measured.first.rounds,
+        "seconds": measured.seconds,
+        "model_steps_per_second": predicted,
+    }
+
+
+def _endless_config(config: RunConfig, samplers: int) -> RunConfig:
     """`config` with so many samplers, little random play, and no end of its own."""
     envs = config.phase1.envs * samplers
     prefill = envs * max(100, config.world_model.length + 8)
-    phase = config.phase1.model_copy(
-        update={
-            **{"envs": envs, "prefill_steps": prefill, "pretrain_updates": 2, "check_every": 10**6},
-            **{"max_steps": 10**12, "target_score": 1e9, "patience": 10**9},
-        }
-    )
+    endless = {"max_steps": 10**12, "target_score": 1e9, "patience": 10**9, "check_every": 10**6}
+    phase = config.phase1.model_copy(update={"envs": envs, "prefill_steps": prefill, "pretrain_updates": 2, **endless})
     cluster = config.cluster.model_copy(update={"samplers": samplers, "sampler_cpus": 0.01})
     run = config.run.model_copy(update={"schedule": "async", "checkpoint_seconds": 1e9, "id": None})
     tracking = config.tracking.model_copy(update={"enabled": False})
     return config.model_copy(update={"phase1": phase, "cluster": cluster, "run": run, "tracking": tracking})
 
 
-def _measure(config: RunConfig, seconds: float) -> tuple[dict[str, Any], int]:
-    """What `Timed` saw, and the bytes of a segment file of one round of one sampler."""
+def _measure_once(config: RunConfig, seconds: float) -> tuple[Measured, int]:
+    """What was measured, and the bytes of a segment file of one round of one sampler."""
     root = Path(tempfile.mkdtemp(prefix="popgen-bench-"))
     config = config.model_copy(update={"run": config.run.model_copy(update={"root": str(root)})})
     spec = build_env(config.env, 1).spec
     recorder = RunRecorder(config, spec)
-    driver = XpmWm(config, spec, recorder, NullReporter())
+    transport = RayTransport(config.cluster)
+    training = open_training(config, spec, f"{recorder.run_id}.{recorder.attempt}", transport)
+    checkpoints = open_checkpoints(config, recorder.dir, training, transport)
     try:
-        driver.checkpoints.begin(None)
-        seen = Timed(driver, config.run.seed).measure(seconds)
+        driver = TrainingDriver(config, recorder, NullReporter(), training, checkpoints)
+        measured = measure_rounds(driver, seconds)
         last = max((recorder.dir / "checkpoints").glob("segments_*"))
-        return seen, last.stat().st_size
+        return measured, last.stat().st_size
     finally:
-        driver.crew.dismiss()
+        checkpoints.close()
+        training.close()
         recorder.close("KILLED")
         shutil.rmtree(root, ignore_errors=True)
 
 
-def _costs(seen: dict[str, Any], data: int) -> Costs:
+def costs_of(measured: Measured, data: int) -> Costs:
     """A round of each learner is one of its tasks."""
-    done = seen["done"]
-    tasks = max(1, sum(count for name, count in done.items() if name.startswith("sampler")))
-    share = {name: seen["cpu"][name] / max(1, done[name]) for name in LEARNERS}
+    sampling = measured.work("sampler")
+    tasks = max(1, sampling.tasks)
+    learning = {name: measured.work(name) for name in LEARNERS}
+    share = {name: work.cpu_seconds / max(1, work.tasks) for name, work in learning.items()}
     return Costs(
-        steps=seen["steps"] / tasks,
-        sampler=seen["cpu"]["sampler"] / tasks,
-        driver=seen["driver_cpu"] / tasks,
+        steps=measured.steps / tasks,
+        sampler=sampling.cpu_seconds / tasks,
+        driver=(measured.last.driver_cpu - measured.first.driver_cpu) / tasks,
         model=share["model"],
         agent=share["agent"],
         data=float(data),

@@ -1,25 +1,28 @@
-"""The main job: a population by any method, its evaluation and its report.
-
-A method is a driver: a class that trains the members which the run's recorder do not hold yet.
-"""
+"""The main job: a population by any method, its evaluation and its report, over the deaths of actors and nodes."""
 
 from __future__ import annotations
 
 import sys
 import time
 from importlib import import_module
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import ray
 from ray.exceptions import RayError
 
 from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.actors.checkpoint_writer import CheckpointFiles
+from popgen.actors.local_ray import start_ray
+from popgen.actors.ray_transport import RayTransport
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import evaluate_population
-from popgen.pipelines.crew import start_ray
+from popgen.methods.training import Training
+from popgen.methods.transport import InlineTransport, OpenTraining, Transport
+from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.reports.crossplay_report import to_dict, write_report
@@ -31,39 +34,24 @@ from popgen.runs.recorder import RunRecorder, named, run_folder
 from popgen.runs.recovery import RetryBudget, death, first_line, nodes_alive, told, wait_for_room
 from popgen.runs.storage import Mirror
 
-DRIVERS: dict[str, str] = {
-    "xpm_wm": "popgen.pipelines.xpm_wm_driver:XpmWm",
-    "xpm_sim": "popgen.pipelines.xpm_sim_driver:XpmSim",
-    "mappo": "popgen.pipelines.baseline_driver:Mappo",
-    "lipo": "popgen.pipelines.baseline_driver:Lipo",
-    "comedi": "popgen.pipelines.baseline_driver:CoMeDi",
+HALT_SECONDS = 30.0
+"""Least time between two checkpoints where all overlapping work halts for one."""
+
+TRAININGS: dict[str, str] = {
+    "xpm_wm": "popgen.actors.xpm_wm_workers:open_training",
+    "xpm_sim": "popgen.actors.xpm_sim_workers:open_training",
+    "mappo": "popgen.methods.mappo.train:open_training",
+    "lipo": "popgen.methods.mappo.lipo:open_training",
+    "comedi": "popgen.methods.mappo.comedi:open_training",
 }
-"""method -> `module:class`, imported when first needed."""
+"""method -> `module:function`, imported when first needed (`popgen.methods.transport.OpenTraining`)."""
 
 
-class Driver(Protocol):
-    """Trains the members of one run."""
-
-    def __init__(self, config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Reporter) -> None:
-        """RunRecorder and Ray are open; nothing of the method has started."""
-
-    def run(self) -> None:
-        """Train every member that `recorder.population` does not hold, and add it with `recorder.add_member`.
-
-        Every environment step is in `recorder.ledger` before the member that it was spent on is added. An interrupted
-        run is resumed by the same call of a new driver with a new recorder on the same folder: in another process, or
-        in this one after an actor or a node died, for which `run` raises Ray's error once its own actors are gone.
-
-        Raises:
-            FloatingPointError: training diverged.
-            UserError: a checkpoint to go on from is damaged.
-        """
-
-
-def driver_class(method: str) -> type[Driver]:
-    """The driver of a method."""
-    module, _, name = DRIVERS[method].partition(":")
-    return getattr(import_module(module), name)
+def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> Training:
+    """Start the workers of the run's method."""
+    module, _, name = TRAININGS[config.method].partition(":")
+    start: OpenTraining = getattr(import_module(module), name)
+    return start(config, spec, attempt, transport)
 
 
 def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
@@ -78,8 +66,8 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         (`popgen.reports.crossplay_report`), files (paths by name or suffix), seconds.
 
     Raises:
-        UserError: training diverged, the disk is (nearly) full, a checkpoint to go on from is damaged, another process
-            is at this run, or actors died `cluster.retries` times in a row without progress.
+        UserError: training diverged, the disk is (nearly) full, a checkpoint to continue from is damaged, another
+            process is at this run, or actors died `cluster.retries` times in a row without progress.
     """
     limit_threads(config.cluster.threads)
     spec = build_env(config.env, 1).spec
@@ -90,7 +78,7 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
             reporter.note(restored)
     recorder = RunRecorder(config, spec)
     reporter.note(f"run {recorder.run_id} in {recorder.dir}")
-    job = _Job(config, spec, recorder, reporter)
+    job = PopulationJob(config, spec, recorder, reporter)
     status = "FAILED"
     try:
         result = job.run()
@@ -112,7 +100,7 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
             job.end()
 
 
-class _Job:
+class PopulationJob:
     """One run in this process: attempts, until one of them reaches the end."""
 
     def __init__(self, config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Reporter) -> None:
@@ -133,10 +121,17 @@ class _Job:
                 retries.spend(self.recorder.progress(), cause)
                 lost = first_line(cause)
             # Outside of the except clause: the error's frames hold what is left of the last attempt.
-            self._go_on(lost, retries.spent)
+            self._continue_from_disk(lost, retries.spent)
+
+    @property
+    def uses_ray(self) -> bool:
+        """Workers are Ray's actors."""
+        return self.config.run.transport == "ray"
 
     def _start_ray(self) -> None:
         """Connect to a cluster and wait for its nodes, or start a local Ray, unless there is one."""
+        if not self.uses_ray:
+            return
         self.mine = start_ray(self.config)
         if self.mine and self.config.cluster.address is not None:
             wait_for_room(self.config, self.reporter.note)
@@ -146,11 +141,25 @@ class _Job:
         reporter = LoggingReporter(self.reporter, recorder.events)
         recorder.tracker.start()
         recorder.save_tracking()
-        driver_class(self.config.method)(self.config, self.spec, recorder, reporter).run()
+        self._train(recorder, reporter)
         result = finish(self.config, self.spec, recorder, reporter)
         return result | {"seconds": round(time.time() - self.began, 1)}
 
-    def _go_on(self, lost: str, spent: int) -> None:
+    def _train(self, recorder: RunRecorder, reporter: Reporter) -> None:
+        """All members that are missing; the workers end with the attempt."""
+        config = self.config
+        transport: Transport = RayTransport(config.cluster) if self.uses_ray else InlineTransport()
+        training = open_training(config, self.spec, f"{recorder.run_id}.{recorder.attempt}", transport)
+        try:
+            checkpoints = open_checkpoints(config, recorder.dir, training, transport)
+            try:
+                TrainingDriver(config, recorder, reporter, training, checkpoints).train_members()
+            finally:
+                checkpoints.close()
+        finally:
+            training.close()
+
+    def _continue_from_disk(self, lost: str, spent: int) -> None:
         """Another recorder, on a cluster with room. A local Ray that lost its node starts anew; so does, after a second
         death at the same place, any connection that this job has made."""
         self.reporter.note(f"{lost}: going on from the last checkpoint")
@@ -170,6 +179,17 @@ class _Job:
         """Ray ends with the job that started it."""
         if self.mine:
             ray.shutdown()
+
+
+def open_checkpoints(config: RunConfig, root: Path, training: Training, transport: Transport) -> CheckpointFiles:
+    """The run's checkpoints, written on the driver's node by a worker of its own where there is bulk to write."""
+    least = HALT_SECONDS if config.run.schedule == "async" and training.log_rows > 1 else 0.0
+    return CheckpointFiles(
+        root,
+        long=training.log_rows,
+        seconds=max(config.run.checkpoint_seconds, least),
+        transport=transport if training.log_rows > 1 else InlineTransport(),
+    )
 
 
 def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Reporter) -> dict[str, Any]:

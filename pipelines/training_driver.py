@@ -16,6 +16,7 @@ from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.runs.checkpoints import fitting, member_folder
 from popgen.runs.recorder import RunRecorder
+from popgen.runs.recovery import wait_for_room
 
 
 class TrainingDriver:
@@ -48,6 +49,8 @@ class TrainingDriver:
         while first <= self.config.population.size:
             if checkpoint is None:
                 self.checkpoints.begin(base)
+            if self.training.begins_workers:
+                wait_for_room(self.config, self.reporter.note)  # RLlib would wait for ever
             self.running = self.training.begin(self.training.first_of_group(first))
             if checkpoint is not None:
                 with fitting(self.checkpoints.folder):
@@ -92,7 +95,9 @@ class TrainingDriver:
                 self.checkpoints.append(sampled.segments, record.member)
             self.recorder.record_sampling(record.member, sampled.collected)
         for count in record.counted:
-            self.recorder.record_step_count(count)
+            self.recorder.record_steps(
+                count.member, count.kind, count.sampler, count.sequence, count.steps, count.episodes, count.score
+            )
 
     def _record_figures(self, record: Progress) -> None:
         """A point of metrics.

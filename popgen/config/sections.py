@@ -76,6 +76,7 @@ class TrackingConfig(Schema):
 class RunSection(Schema):
     """Identity and place of the run.
 
+    transport: where workers are: Ray's actors, or objects of the driver's process (`inline`: a notebook, a debugger).
     overlap: with schedule=async, rounds that a learner may do for each of the samplers'.
     checkpoint_seconds: least time between two checkpoints; 0: after every iteration.
     disk_reserve: bytes; with less room left the run stops by itself, its checkpoints whole.
@@ -86,6 +87,7 @@ class RunSection(Schema):
     root: str = "runs"
     seed: Annotated[_Int, Field(ge=0, lt=2**31)] = 0
     schedule: Literal["sync", "async"] = "sync"
+    transport: Literal["ray", "inline"] = "ray"
     overlap: Annotated[_Int, Field(ge=1, le=1000)] = 4
     checkpoint_seconds: Weight = 0.0
     disk_reserve: Annotated[_Int, Field(ge=0, le=2**50)] = 64 * 2**20

@@ -6,7 +6,7 @@ of it (`TrainedMember`). It writes no file, counts no step in a ledger and print
 checkpoint at a `Round` with `at_rest`. The driver answers a `Round` with True where it wants a checkpoint and the round
 was not at rest: the loop then comes to rest soon and yields a `Round` that is.
 
-    training = method.open_training(...)          # workers of one attempt
+    training = open_training(...)                 # workers of one attempt
     training.adopt(weights, left)                 # members that are trained already
     members = training.begin(first)               # fresh networks for the members that learn together from `first` on
     training.restore(checkpoint)                  # only where there is one of these members
@@ -20,11 +20,9 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from popgen.config.run_config import RunConfig
-from popgen.envs.contract import EnvSpec
 from popgen.nets.weights import Weights
-from popgen.play.policy import Policy
 from popgen.play.episodes import Episode
+from popgen.play.policy import Policy
 from popgen.types import Kind, Segment
 
 State = dict[str, Any]
@@ -227,11 +225,13 @@ class Training(Protocol):
 
     Attributes:
         learners: first parts of figures' names (`model/loss`) that must be finite: a learner does not recover.
-        log_rows: rows in the log from which on a whole copy of the buffers is written.
+        log_rows: rows in the log from which on a whole copy of the buffers is written; 1 where there is no log.
+        begins_workers: `begin` starts workers: the cluster must have room for them then.
     """
 
     learners: tuple[str, ...]
     log_rows: int
+    begins_workers: bool
 
     def adopt(self, weights: dict[int, Weights], left: State) -> None:
         """Take over finished members: their acting weights, and what the last of them left behind ({} if nothing)."""
@@ -264,15 +264,3 @@ class Training(Protocol):
 
     def close(self) -> None:
         """End all workers."""
-
-
-class OpenTraining(Protocol):
-    """What a method gives: the start of its workers.
-
-    Args:
-        config: of the run.
-        spec: of its environment.
-        attempt: unique to the run's attempt; part of the samplers' names in the ledger.
-    """
-
-    def __call__(self, config: RunConfig, spec: EnvSpec, attempt: str) -> Training: ...

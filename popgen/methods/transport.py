@@ -10,7 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar
 
-from popgen.methods.training import Pending
+from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
+from popgen.methods.training import Pending, Training
 
 W = TypeVar("W")
 T = TypeVar("T")
@@ -51,6 +53,19 @@ class Transport(Protocol):
     def wait(self, pending: Sequence[Pending[Any]], timeout: float | None = None) -> list[Pending[Any]]:
         """Those whose results are there: at least one, or after `timeout` seconds perhaps none."""
         ...
+
+
+class OpenTraining(Protocol):
+    """What a method gives: the start of its workers.
+
+    Args:
+        config: of the run.
+        spec: of its environment.
+        attempt: unique to the run's attempt; part of the samplers' names in the ledger.
+        transport: where the workers are.
+    """
+
+    def __call__(self, config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> Training: ...
 
 
 # ---- in this process -------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,3 +75,18 @@ def load_optimiser_state(optimiser: torch.optim.Optimizer, saved: dict[str, np.n
         if {name: slot.shape for name, slot in slots.items()} != wanted or slots["step"] < 0:
             raise ValueError(f"an optimiser's moments of parameter {index} do not fit it")
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+def same_form(value: Any, like: Any, name: str = "a part") -> None:
+    """Weights from a checkpoint against those that they are to replace: names, shapes and types.
+
+    Raises:
+        ValueError: they differ.
+    """
+    if isinstance(like, dict):
+        if not isinstance(value, dict) or value.keys() != like.keys():
+            raise ValueError(f"{name} has other tensors")
+        for key, item in like.items():
+            same_form(value[key], item, key)
+    elif not isinstance(value, np.ndarray) or (value.shape, value.dtype) != (like.shape, like.dtype):
+        raise ValueError(f"{name} is of another shape or type")

@@ -21,8 +21,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from popgen.errors import UserError
 from popgen.runs.segment_files import load_segments, save_segments
 from popgen.runs.state_files import load_state, save_state
@@ -48,21 +46,6 @@ def fitting(folder: Path) -> Iterator[None]:
         reason = f"no {cause}" if isinstance(cause, KeyError) else str(cause).partition("\n")[0]
         problem = f"its checkpoint does not fit this run ({reason})"
         raise UserError(str(folder), problem, "remove it or start a new run") from None
-
-
-def same_form(value: Any, like: Any, name: str = "a part") -> None:
-    """Weights from a checkpoint against those that they are to replace: names, shapes and types.
-
-    Raises:
-        ValueError: they differ.
-    """
-    if isinstance(like, dict):
-        if not isinstance(value, dict) or value.keys() != like.keys():
-            raise ValueError(f"{name} has other tensors")
-        for key, item in like.items():
-            same_form(value[key], item, key)
-    elif not isinstance(value, np.ndarray) or (value.shape, value.dtype) != (like.shape, like.dtype):
-        raise ValueError(f"{name} is of another shape or type")
 
 
 def finished_member(root: Path, member: int) -> dict[str, Any]:

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from popgen.actors.sampler_actor import Collected
 from popgen.actors.tracker_actor import RemoteTracker
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.jsonable import unique
+from popgen.methods.training import Collected
 from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.population import PopulationWriter, load_population
@@ -124,9 +124,11 @@ class RunRecorder:
             self.ledger.record(entry)
         self._flush_ledger()
 
-    def record_steps(self, member: int, kind: Kind, name: str, sequence: int, steps: int, episodes: int) -> None:
+    def record_steps(
+        self, member: int, kind: Kind, name: str, sequence: int, steps: int, episodes: int, score: float = 0.0
+    ) -> None:
         """Enter steps that no sampler actor took."""
-        self.ledger.record(LedgerEntry(self.run_id, member, kind, name, sequence, steps, episodes, 0.0))
+        self.ledger.record(LedgerEntry(self.run_id, member, kind, name, sequence, steps, episodes, score))
         self._flush_ledger()
 
     def record_evaluation(self, member: int, steps: int, episodes: int) -> None:

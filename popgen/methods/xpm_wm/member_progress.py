@@ -1,0 +1,260 @@
+"""How far a member's training has come: the records that a checkpoint holds, and the rules that end a phase.
+
+Rules are functions of a progress record and the recipe; nothing runs for them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from popgen.methods.training import Pending, State
+from popgen.methods.xpm_wm.config import Phase1Config, Phase2Config
+from popgen.methods.xpm_wm.start_states import Starts
+from popgen.nets.weights import Weights
+from popgen.play.partner_strength import PartnerStrength
+
+CONFIRMED = 0.97
+"""Share of the target that the last policy must reach by itself."""
+GOOD_ENOUGH = 0.95
+"""Share of the best window from which on the last weights are taken, which learned longer."""
+
+Put = Callable[[Any], Pending[Any]]
+
+
+@dataclass(frozen=True)
+class MemberWeights:
+    """Handles of what a member's learner published: filter and actor (`acting`), critics, and the world model, of the
+    same filter, that it learned in."""
+
+    acting: Pending[Weights]
+    critics: Pending[Weights]
+    model: Pending[Weights]
+
+    def to_state(self) -> State:
+        """For a checkpoint."""
+        return {"acting": self.acting, "critics": self.critics, "model": self.model}
+
+    @staticmethod
+    def from_state(state: State, put: Put) -> MemberWeights:
+        """From `to_state()`, as it was read."""
+        return MemberWeights(put(state["acting"]), put(state["critics"]), put(state["model"]))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A policy as it played some real episodes, and what it scored in self-play and strongest cross-play."""
+
+    weights: MemberWeights
+    sp: float
+    xp: float
+
+    @property
+    def merit(self) -> float:
+        """Self-play less the strongest cross-play: what a member is chosen by."""
+        return self.sp - self.xp
+
+    def to_state(self) -> State:
+        """For a checkpoint."""
+        return {"published": self.weights.to_state(), "sp": self.sp, "xp": self.xp}
+
+    @staticmethod
+    def from_state(state: State, put: Put) -> Candidate:
+        """From `to_state()`, as it was read."""
+        return Candidate(MemberWeights.from_state(state["published"], put), float(state["sp"]), float(state["xp"]))
+
+
+@dataclass
+class FirstMemberProgress:
+    """Member 1.
+
+    Attributes:
+        window: episodes that a score is the mean of.
+        steps: environment steps so far.
+        rounds: that have ended.
+        since_best: rounds since the best window, once there was one.
+        confirmations: how often the last policy has been looked at by itself.
+        restarted: actor and critics have started again.
+        plays: self-play has begun (`agent.entropy_after` of the target).
+        confirmed: the last policy is good by itself.
+        recent, shaped: scores and shaped returns of the last episodes.
+        figures: the last value of every figure.
+        best: the policy of the best window.
+        published, played: the weights learned last, and those that play.
+        model, starts: of the world model's last update.
+    """
+
+    window: int
+    steps: int = 0
+    rounds: int = 0
+    since_best: int = 0
+    confirmations: int = 0
+    restarted: bool = False
+    plays: bool = False
+    confirmed: bool = False
+    recent: deque[float] = field(default_factory=deque)
+    shaped: deque[float] = field(default_factory=deque)
+    figures: dict[str, float] = field(default_factory=dict)
+    best: Candidate | None = None
+    published: MemberWeights | None = None
+    played: MemberWeights | None = None
+    model: Pending[Weights] | None = None
+    starts: Pending[Starts] | None = None
+
+    def add_episodes(self, scores: Iterable[float], shaped: Iterable[float]) -> None:
+        """Episodes that have ended; only the last `window` count."""
+        self.recent = deque([*self.recent, *scores], self.window)
+        self.shaped = deque([*self.shaped, *shaped], self.window)
+
+    def to_state(self) -> State:
+        """For a checkpoint."""
+        assert self.published is not None
+        return {
+            "rounds": self.rounds,
+            "since_best": self.since_best,
+            "confirmations": self.confirmations,
+            "restarted": self.restarted,
+            "plays": self.plays,
+            "recent": list(self.recent),
+            "shaped": list(self.shaped),
+            "figures": dict(self.figures),
+            "best": None if self.best is None else self.best.to_state(),
+            "published": self.published.to_state(),
+            "model": self.model,
+            "starts": self.starts,
+        }
+
+    @staticmethod
+    def from_state(state: State, window: int, steps: int, put: Put) -> FirstMemberProgress:
+        """From `to_state()`, as it was read."""
+        progress = FirstMemberProgress(
+            window,
+            steps,
+            rounds=int(state["rounds"]),
+            since_best=int(state["since_best"]),
+            confirmations=int(state["confirmations"]),
+            restarted=bool(state["restarted"]),
+            plays=bool(state["plays"]),
+            figures={str(name): float(value) for name, value in state["figures"].items()},
+            best=None if state["best"] is None else Candidate.from_state(state["best"], put),
+            published=MemberWeights.from_state(state["published"], put),
+            model=put(state["model"]),
+            starts=put(Starts(**state["starts"])),
+        )
+        progress.add_episodes(map(float, state["recent"]), map(float, state["shaped"]))
+        return progress
+
+
+@dataclass
+class LaterMemberProgress:
+    """Members 2..M.
+
+    Attributes:
+        strength: each partner's returns in real cross-play.
+        steps: environment steps so far.
+        rounds: of real episodes that have ended.
+        plays: self-play has begun (`agent.entropy_after` of the target).
+        best: the policy of the best round.
+    """
+
+    strength: PartnerStrength
+    steps: int = 0
+    rounds: int = 0
+    plays: bool = False
+    best: Candidate | None = None
+
+    def to_state(self) -> State:
+        """For a checkpoint, after the first round."""
+        assert self.best is not None
+        return {
+            "rounds": self.rounds,
+            "plays": self.plays,
+            "best": self.best.to_state(),
+            "strength": self.strength.state(),
+        }
+
+    @staticmethod
+    def from_state(state: State, strength: PartnerStrength, steps: int, put: Put) -> LaterMemberProgress:
+        """From `to_state()`, as it was read."""
+        strength.load_state(state["strength"])
+        best = Candidate.from_state(state["best"], put)
+        return LaterMemberProgress(strength, steps, int(state["rounds"]), bool(state["plays"]), best)
+
+
+# ---- rules of phase 1 ------------------------------------------------------------------------------------------------
+
+
+def mean_score(progress: FirstMemberProgress) -> float:
+    """Of the last episodes; 0 where there are none."""
+    return float(np.mean(progress.recent)) if progress.recent else 0.0
+
+
+def has_full_window(progress: FirstMemberProgress) -> bool:
+    """Enough episodes to judge by."""
+    return len(progress.recent) == progress.window
+
+
+def reached_target(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
+    """The target, over a full window of episodes."""
+    return has_full_window(progress) and mean_score(progress) >= phase.target_score
+
+
+def should_stop(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
+    """Budget spent, target reached, or no better for `patience` rounds."""
+    spent = progress.steps >= phase.max_steps
+    return spent or reached_target(progress, phase) or progress.since_best >= phase.patience
+
+
+def restart_is_due(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
+    """Whether actor and critics start again, once (an actor can get stuck, a model less)."""
+    wanted = phase.restart_updates > 0 and not progress.restarted
+    return wanted and progress.steps >= phase.restart_after
+
+
+def may_confirm(progress: FirstMemberProgress, phase: Phase1Config, horizon: int) -> bool:
+    """Whether the budget leaves room for a whole episode of the last policy in each environment."""
+    return progress.steps + phase.envs * horizon <= phase.max_steps
+
+
+def is_confirmed(score: float, phase: Phase1Config) -> bool:
+    """Whether a policy that scored so by itself is good enough: a window's episodes are of several policies."""
+    return score >= CONFIRMED * phase.target_score
+
+
+def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after: float) -> None:
+    """Remember the policy that played, not the one learned meanwhile; rounds count once there is a full window."""
+    if not has_full_window(progress):
+        return
+    score = mean_score(progress)
+    progress.plays |= score >= entropy_after * phase.target_score
+    if progress.best is None or score > progress.best.sp:
+        assert progress.played is not None
+        progress.best, progress.since_best = Candidate(progress.played, score, 0.0), 0
+    else:
+        progress.since_best += 1
+
+
+def choose_first(progress: FirstMemberProgress) -> Candidate:
+    """The policy with the best window, unless the last one is about as good."""
+    assert progress.published is not None
+    last, best = Candidate(progress.published, mean_score(progress), 0.0), progress.best
+    return last if progress.confirmed or best is None or last.sp >= GOOD_ENOUGH * best.sp else best
+
+
+# ---- rules of phase 2 ------------------------------------------------------------------------------------------------
+
+
+def most_rounds(phase: Phase2Config, episodes_xp: int, horizon: int) -> int:
+    """Rounds of real episodes at most: those configured, fewer where the environment steps end first."""
+    most, each = max(phase.rounds, phase.max_rounds), (phase.episodes_sp + episodes_xp) * horizon
+    return most if phase.max_steps is None else max(1, min(most, phase.max_steps // each))
+
+
+def plays_on(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> bool:
+    """The configured rounds are played in any case, further ones only by a member that is still weak."""
+    weak = progress.best is None or progress.best.sp < phase.target_score
+    return progress.rounds < (most if weak else min(phase.rounds, most))

@@ -1,0 +1,131 @@
+"""XPM-WM, member after member (paper, algorithm 1 and section 4.2): what members hand on, checkpoints, resuming."""
+
+from __future__ import annotations
+
+import time
+
+from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
+from popgen.methods.training import Checkpoint, Loop, Pending, Progress, State, TrainedMember
+from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
+from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
+from popgen.methods.xpm_wm.workers import Workers
+from popgen.nets.weights import Weights, same_form
+from popgen.play.partner_strength import PartnerStrength
+
+
+class XpmWmTraining:
+    """The `Training` of XPM-WM on any workers."""
+
+    learners = LEARNERS
+    begins_workers = False
+
+    def __init__(self, config: RunConfig, spec: EnvSpec, work: Workers) -> None:
+        self.config, self.spec, self.work = config, spec, work
+        self.log_rows = max(1, config.replay.capacity // 2)
+        self.weights: dict[int, Weights] = {}
+        self.archive: dict[int, Pending[Weights]] = {}
+        self.member, self.seed, self.began, self.resumed = FIRST, 0, time.time(), False
+        self.progress: FirstMemberProgress | LaterMemberProgress = self._fresh_progress(0)
+
+    def _fresh_progress(self, steps: int) -> FirstMemberProgress | LaterMemberProgress:
+        if self.member == FIRST:
+            # An episode of each environment: fewer reach the target by luck, where some end in a stand-still.
+            return FirstMemberProgress(max(16, self.config.phase1.envs), steps)
+        return LaterMemberProgress(PartnerStrength(self.config.agent.partner), steps)
+
+    def adopt(self, weights: dict[int, Weights], left: State) -> None:
+        """Take over finished members, their buffers and the world model."""
+        for member, acting in weights.items():
+            self._archive(member, acting)
+        self.work.adopt(left)
+
+    def _archive(self, member: int, acting: Weights) -> None:
+        self.weights[member], self.archive[member] = acting, self.work.put(acting)
+
+    def first_of_group(self, member: int) -> int:
+        """Members learn one after the other."""
+        return member
+
+    def begin(self, first: int) -> tuple[int, ...]:
+        """A fresh agent on the world model so far."""
+        self.member, self.seed = first, self.config.run.seed * 1000 + first
+        self.began, self.resumed = time.time(), False
+        self.progress = self._fresh_progress(0)
+        self.work.begin_member(first, self.seed, self.weights)
+        return (first,)
+
+    def train(self) -> Loop:
+        """One member."""
+        if self.resumed:
+            steps = self.progress.steps
+            yield Progress(self.member, steps, note=f"continuing after {steps:,} steps of member {self.member}")
+        candidate = yield from (self._first().train(self.resumed) if self.member == FIRST else self._later().train())
+        yield from self._complete(candidate)
+
+    def _first(self) -> FirstMember:
+        assert isinstance(self.progress, FirstMemberProgress)
+        return FirstMember(self.work, self.config, self.spec, self.seed, self.progress)
+
+    def _later(self) -> LaterMember:
+        assert isinstance(self.progress, LaterMemberProgress)
+        archive = self.archive
+        return LaterMember(self.work, self.config, self.spec, self.member, self.seed, archive, self.progress)
+
+    def _complete(self, candidate: Candidate) -> Loop:
+        """The member as it is saved, with the buffers and the world model that the next one starts from."""
+        acting, model, critics = (
+            handle.result() for handle in (candidate.weights.acting, candidate.weights.model, candidate.weights.critics)
+        )
+        training = {f"model.{name}": value for name, value in model.items() if not name.startswith("filter.")}
+        training |= {f"critics.{name}": value for name, value in critics.items()}
+        report, seconds, steps = self.work.report_model().result(), time.time() - self.began, self.progress.steps
+        yield Progress(self.member, steps, {"final_sp": candidate.sp, "final_xp": candidate.xp, **report})
+        policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
+        policy.load(acting)
+        extra = {"sp": candidate.sp, "xp": candidate.xp, "seconds": round(seconds, 1), "world_model": report}
+        note = (
+            f"member {self.member}: SP {candidate.sp:.2f}, XP {candidate.xp:.2f} {self.spec.score_name} in training, "
+            f"{steps:,} environment steps, {seconds / 60:.1f} min"
+        )
+        left = {**self.work.buffers_state(), "model": self.work.model_state()}
+        yield TrainedMember(self.member, policy, training, self.seed, extra, left, note)
+        self._archive(self.member, acting)
+
+    # ---- checkpoints -----------------------------------------------------------------------------------------------
+
+    def checkpoint(self) -> State:
+        """The member's progress, and the state of all workers but the buffers, which the log holds."""
+        return {**self.work.state(), "progress": self.progress.to_state(), "steps": self.progress.steps}
+
+    def buffers(self) -> State:
+        """Both buffers whole."""
+        return self.work.buffers_state()
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Continue where `checkpoint` was made.
+
+        Raises:
+            LookupError, TypeError, ValueError: a part is missing or does not fit.
+        """
+        state, steps = checkpoint.state["progress"], int(checkpoint.state["steps"])
+        self.work.restore(checkpoint)
+        form = self.work.published_form()
+        if self.member == FIRST:
+            best = state["best"] or state
+            for weights in (state["published"], {**state["published"], "model": state["model"]}, best["published"]):
+                same_form(weights, form, "the published policy")
+            window = max(16, self.config.phase1.envs)
+            self.progress = FirstMemberProgress.from_state(state, window, steps, self.work.put)
+            self._first().start_self_play()
+            self.work.restore_samplers(checkpoint.state["samplers"])
+        else:
+            same_form(state["best"]["published"], form, "the published policy")
+            strength = PartnerStrength(self.config.agent.partner)
+            self.progress = LaterMemberProgress.from_state(state, strength, steps, self.work.put)
+        self.resumed = True
+
+    def close(self) -> None:
+        """End all workers."""
+        self.work.end()

@@ -1,0 +1,145 @@
+"""What the training loop asks of its workers, wherever they run, and what they answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
+from popgen.methods.xpm_wm.member_progress import MemberWeights
+from popgen.methods.xpm_wm.start_states import Starts
+from popgen.nets.weights import Weights
+from popgen.play.matches import Match
+
+
+@dataclass(frozen=True)
+class ModelUpdate:
+    """Of the world model: handles of its weights and of start states from the training windows (None if not asked
+    for), mean metrics."""
+
+    weights: Pending[Weights]
+    starts: Pending[Starts] | None
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True)
+class AgentTask:
+    """Updates of the agent in imagination.
+
+    Attributes:
+        updates: how many.
+        model: the world model to imagine with.
+        starts: states to start from.
+        new_share: share of the starts from this member's own data.
+        partner_scores: each partner's return in real cross-play, of those seen.
+        plays: real self-play has begun.
+    """
+
+    updates: int
+    model: Pending[Weights]
+    starts: Pending[Starts]
+    new_share: float
+    partner_scores: dict[int, float]
+    plays: bool
+
+
+@dataclass(frozen=True)
+class AgentUpdate:
+    """Of the agent: what it published, mean metrics."""
+
+    weights: MemberWeights
+    metrics: dict[str, float]
+
+
+class Workers(Protocol):
+    """Samplers of real episodes, both buffers, the world model's learner and the agent's."""
+
+    def begin_member(self, member: int, seed: int, archive: dict[int, Weights]) -> None:
+        """Line 1: a fresh actor and critics; the world model, beside the archived filters of those before."""
+
+    def restart_agent(self, seed: int) -> None:
+        """Fresh actor and critics (line 1) for the same member and world model."""
+
+    def start_episodes(
+        self, matches: list[Match], policies: dict[int, PolicySnapshot], seed: int, stagger: bool = False
+    ) -> None:
+        """All samplers begin fresh episodes of these matches."""
+
+    def collect(self, steps: int) -> list[Sampled]:
+        """All samplers play `steps` joint steps (lines 17 and 20)."""
+        ...
+
+    def add_to_buffers(self, sampled: Sequence[Sampled], owner: int) -> None:
+        """Segments of self-play and random play into B_SP, of cross-play into B_XP (lines 18 and 21)."""
+
+    def samplers(self) -> list[str]:
+        """Names of the samplers that have matches."""
+        ...
+
+    def start_sampling(self, sampler: str, steps: int, member: int, acting: Pending[Weights]) -> Pending[Sampled]:
+        """One sampler plays on, with new weights of one member."""
+        ...
+
+    def update_world_model(self, updates: int, starts_per_update: int, chosen: bool = True) -> Pending[ModelUpdate]:
+        """Gradient steps on windows from both buffers (lines 6 and 7), with start states from those windows: also from
+        those chosen for an event, or not."""
+        ...
+
+    def cache_starts(self) -> Pending[Starts]:
+        """Start states from both buffers through the present world model (lines 8 and 10)."""
+        ...
+
+    def model_weights(self) -> Pending[Weights]:
+        """The present world model."""
+        ...
+
+    def report_model(self) -> Pending[dict[str, float]]:
+        """How well the world model predicts, on fresh windows."""
+        ...
+
+    def update_agent(self, task: AgentTask) -> Pending[AgentUpdate]:
+        """Simulate and update in the world model (lines 8 to 15)."""
+        ...
+
+    # ---- checkpoints -----------------------------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """Learners, samplers' episodes and the buffers' generators; handles."""
+        ...
+
+    def buffers_state(self) -> State:
+        """Both buffers whole; handles."""
+        ...
+
+    def model_state(self) -> Pending[State]:
+        """The world model's learner."""
+        ...
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Buffers and learners as `state` found them; the member must have begun.
+
+        Raises:
+            LookupError, TypeError, ValueError: a part is missing or does not fit.
+        """
+
+    def restore_samplers(self, states: list[State]) -> None:
+        """The running episodes, after `start_episodes` with the same matches."""
+
+    def adopt(self, left: State) -> None:
+        """Buffers and world model as a finished member left them."""
+
+    def published_form(self) -> State:
+        """Weights of the form that `MemberWeights` has at present: acting, model, critics."""
+        ...
+
+    def end(self) -> None:
+        """End all workers."""
+
+    def put(self, value: Any) -> Pending[Any]:
+        """A handle of a value that is there."""
+        ...
+
+    def wait(self, pending: Sequence[Pending[Any]], timeout: float | None = None) -> list[Pending[Any]]:
+        """Handles whose results are there: at least one, or after `timeout` seconds perhaps none."""
+        ...
