@@ -76,5 +76,5 @@ class XpmSimWorkers:
 
 
 def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> XpmSimTraining:
-    """Start the workers of one attempt; see `popgen.methods.training.OpenTraining`."""
+    """Start the workers of one attempt; see `popgen.methods.transport.OpenTraining`."""
     return XpmSimTraining(config, spec, attempt, XpmSimWorkers(config, attempt, transport))

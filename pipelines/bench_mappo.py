@@ -8,11 +8,11 @@ from typing import Any, cast
 import ray
 
 from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.actors.local_ray import start_ray
 from popgen.config.run_config import RunConfig
 from popgen.methods.mappo.algorithm import Mappo, MappoConfig
+from popgen.methods.mappo.train import check_card
 from popgen.methods.mappo.training_job import Job
-from popgen.pipelines.baseline_driver import check_card
-from popgen.pipelines.crew import start_ray
 from popgen.runs.recovery import wait_for_room
 
 

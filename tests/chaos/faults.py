@@ -19,7 +19,7 @@ ACTORS = {
     "sampler": {"xpm_wm": "SamplerActor", "xpm_sim": "SamplerActor", "default": "Runner"},
     "replay": {"xpm_wm": "ReplayActor"},
     "model learner": {"xpm_wm": "ModelActor"},
-    "agent learner": {"xpm_wm": "AgentActor", "xpm_sim": "ExactLearnerActor", "default": "Learner|Algorithm|Job"},
+    "agent learner": {"xpm_wm": "AgentActor", "xpm_sim": "SimulatedAgentActor", "default": "Learner|Algorithm|Job"},
 }
 """Who is killed -> method -> what its process is called; a method without an entry has no such actor."""
 

@@ -18,20 +18,28 @@ import pytest
 import ray
 import torch
 
+from popgen.actors.checkpoint_writer import CheckpointFiles
+from popgen.actors.ray_transport import RayTransport
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.config.sections import ClusterConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.methods.mappo import comedi, lipo
 from popgen.methods.mappo.algorithm import Mappo as Algorithm
-from popgen.pipelines import baseline_driver as baselines
-from popgen.pipelines.population import driver_class, run_population
+from popgen.methods.mappo.config import DiversityConfig
+from popgen.methods.mappo.objective import SELF_PLAY
+from popgen.methods.mappo.train import GroupProgress, check_card, learning_members
+from popgen.methods.transport import InlineTransport
+from popgen.pipelines.population import open_training, run_population
+from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import Population, load_population
 from popgen.progress import NullReporter
-from popgen.runs import checkpoints
 from popgen.runs.ledger import Ledger
 from popgen.runs.preflight import preflight
 from popgen.runs.recorder import RunRecorder
+from popgen.runs.state_files import load_state, save_state
+from popgen.types import Kind
 
 HORIZON = 40
 SP_STEPS = 240
@@ -120,9 +128,13 @@ def launch(
                 said[counted.owner, str(counted.kind)] += counted.steps
             return result
 
-        def save(folder: Path, state: dict[str, Any], original: Any = baselines.save_state) -> None:
+        def save(self: CheckpointFiles, *given: Any, original: Any = CheckpointFiles.save) -> None:
             called("save")
-            original(folder, state)
+            original(self, *given)
+
+        def save_member(self: CheckpointFiles, *given: Any, original: Any = CheckpointFiles.save_member) -> None:
+            called("save")
+            original(self, *given)
 
         def add(self: RunRecorder, *given: Any, original: Any = RunRecorder.add_member, **named: Any) -> None:
             called("add")
@@ -130,14 +142,18 @@ def launch(
             called("added")
 
         patch.setattr(Algorithm, "train", train)
-        for module in (baselines, checkpoints):
-            patch.setattr(module, "save_state", save)
+        patch.setattr(CheckpointFiles, "save", save)
+        patch.setattr(CheckpointFiles, "save_member", save_member)
         patch.setattr(RunRecorder, "add_member", add)
         spec = make_env(config.env.name, 1, **config.env.params).spec
         recorder = RunRecorder(config, spec)
+        attempt, transport = f"{recorder.run_id}.{recorder.attempt}", RayTransport(config.cluster)
+        training = open_training(config, spec, attempt, transport)
+        files = CheckpointFiles(recorder.dir, long=training.log_rows, seconds=config.run.checkpoint_seconds)
         try:
-            driver_class(config.method)(config, spec, recorder, reporter).run()
+            TrainingDriver(config, recorder, reporter, training, files).train_members()
         finally:
+            training.close()
             recorder.close("FINISHED")
     return Run(recorder.dir, said, reporter.notes)
 
@@ -363,9 +379,9 @@ def test_a_ledger_that_lacks_entries_is_refused(root: Path) -> None:
 def test_a_checkpoint_of_other_sizes_is_refused(root: Path) -> None:
     interrupted(root, "other")
     for path in (root / "other" / "checkpoints").glob("progress_*"):
-        state = checkpoints.load_state(path)
+        state = load_state(path)
         state["algorithm"]["learner"]["modules"]["1"]["actor.0.weight"] = np.zeros((3, 3), np.float32)
-        checkpoints.save_state(path, state)
+        save_state(path, state)
     with pytest.raises(UserError, match="does not fit this run"):
         launch(root, "other", "method=mappo", SIZES["mappo"])
     shutil.rmtree(root / "other")
@@ -373,9 +389,9 @@ def test_a_checkpoint_of_other_sizes_is_refused(root: Path) -> None:
 
 def test_a_card_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    baselines.check_card(ClusterConfig())
+    check_card(ClusterConfig())
     with pytest.raises(UserError, match="cluster.agent_gpus: 1, but the driver.* sees no GPU"):
-        baselines.check_card(ClusterConfig(agent_gpus=1.0))
+        check_card(ClusterConfig(agent_gpus=1.0))
 
 
 def test_runners_that_find_no_room_are_refused(root: Path) -> None:
@@ -399,9 +415,41 @@ def test_what_cannot_be_is_refused_before_anything_starts(root: Path) -> None:
     )
 
 
-def test_every_method_has_its_driver() -> None:
-    found = {method: driver_class(method) for method in SIZES}
-    assert found == {"mappo": baselines.Mappo, "lipo": baselines.Lipo, "comedi": baselines.CoMeDi}
+def test_rllib_needs_ray(root: Path) -> None:
+    config = smoke(root, "inline", "method=lipo")
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    with pytest.raises(UserError, match="run.transport: is inline, but RLlib needs Ray"):
+        open_training(config, spec, "inline.1", InlineTransport())
+
+
+def test_objectives_say_what_is_sampled_and_its_sign() -> None:
+    recipe, unmixed = DiversityConfig(lambda_xp=0.5, lambda_mp=0.25), DiversityConfig(lambda_xp=0.0, lambda_mp=0.0)
+
+    def signed(terms: Any) -> dict[str, float]:
+        return {str(term.kind): term.sign * term.weight(recipe) for term in terms}
+
+    assert signed(SELF_PLAY.terms) == {}
+    assert signed(lipo.OBJECTIVE.terms) == {"XP": -0.5}
+    assert signed(comedi.OBJECTIVE.terms) == {"MP": 0.25, "XP": -0.5}
+    for objective, samples in ((SELF_PLAY, ()), (lipo.OBJECTIVE, ("XP",)), (comedi.OBJECTIVE, ("XP", "MP"))):
+        assert [kind for kind in ("XP", "MP") if objective.samples(Kind(kind), recipe)] == list(samples)
+    assert comedi.OBJECTIVE.samples(Kind.XP, unmixed) and not comedi.OBJECTIVE.samples(Kind.MP, unmixed)
+
+
+def test_who_learns_together(root: Path) -> None:
+    together = smoke(root, "group", "method=lipo", "population.size=3")
+    alone = smoke(root, "group", "method=lipo", "population.size=3", "diversity.order=sequential")
+    assert learning_members(lipo.OBJECTIVE, together, 2) == (1, 2, 3)
+    assert learning_members(lipo.OBJECTIVE, alone, 2) == (2,)
+    assert learning_members(SELF_PLAY, together, 2) == (2,)
+
+
+def test_progress_is_read_by_name() -> None:
+    progress = GroupProgress(sequence=4, seconds=1.5, steps={2: 80, 3: 160})
+    saved = {"sequence": 4, "seconds": 1.5, "steps": {"2": 80, "3": 160}}
+    assert GroupProgress.from_state(saved) == progress
+    with pytest.raises(KeyError):
+        GroupProgress.from_state({"sequence": 4})
 
 
 PAPER = {

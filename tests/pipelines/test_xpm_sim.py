@@ -6,28 +6,34 @@ import json
 import shutil
 import tempfile
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import ray
-from support.local_crew import Handle
 
 from popgen.actors.actor_setup import build_env
-from popgen.actors.sampler_actor import SamplerActor
-from popgen.actors.simulated_agent_actor import ExactLearnerActor
+from popgen.actors.checkpoint_writer import CheckpointFiles
+from popgen.actors.xpm_sim_workers import open_training
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
-from popgen.pipelines import xpm_sim_driver as pipeline
+from popgen.methods.transport import InlineTransport
+from popgen.methods.xpm_sim.config import XpmSimConfig
+from popgen.methods.xpm_sim.round_rules import (
+    MemberProgress,
+    round_matches,
+    score_round,
+    seatings,
+    updates_of_round,
+)
 from popgen.pipelines.population import run_population
-from popgen.pipelines.sampler_pool import SamplerPool
-from popgen.pipelines.xpm_sim_driver import Member
+from popgen.pipelines.training_driver import TrainingDriver
+from popgen.play.episodes import Episode
 from popgen.population import load_population
 from popgen.progress import NullReporter
-from popgen.runs.checkpoints import Checkpoints
 from popgen.runs.ledger import Ledger
 from popgen.runs.preflight import preflight
 from popgen.runs.recorder import RunRecorder
@@ -42,19 +48,6 @@ class Killed(RuntimeError):
     """Injected where a driver could be killed."""
 
 
-class LocalCrew(pipeline.Crew):
-    """The actors' objects in this process."""
-
-    @staticmethod
-    def hire(config: RunConfig, attempt: str) -> LocalCrew:
-        names = [f"sampler{i}.{attempt}" for i in range(config.cluster.samplers)]
-        samplers = [Handle(SamplerActor(config.env, name, 1)) for name in names]
-        return LocalCrew(SamplerPool(samplers), Handle(ExactLearnerActor(config, 1)))
-
-    def dismiss(self) -> None:
-        """There is nobody to send away."""
-
-
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("runs")
@@ -67,7 +60,7 @@ def configured(root: Path, name: str, *overrides: str) -> RunConfig:
 
 
 def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
-    """Train without Ray, objects in place of references; the run's folder.
+    """Train in this process, without Ray; the run's folder.
 
     die_at: METHOD:N of the recorder or checkpoints; the run dies before the N-th call of it.
     """
@@ -85,18 +78,15 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
         dying = type(cls.__name__, (cls,), {name: called})
         return dying
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray, "get", lambda given: given)
-        patch.setattr(ray, "put", lambda given: given)
-        patch.setattr(pipeline, "Crew", LocalCrew)
-        patch.setattr(pipeline, "Checkpoints", mortal(Checkpoints, "save"))
-        kind = mortal(mortal(mortal(RunRecorder, "record_sampling"), "record_steps"), "add_member")
-        spec = build_env(config.env, 1).spec
-        recorder = kind(config, spec)
-        try:
-            pipeline.XpmSim(config, spec, recorder, NullReporter()).run()
-        finally:
-            recorder.close("FINISHED")
+    spec = build_env(config.env, 1).spec
+    kind = mortal(mortal(mortal(RunRecorder, "record_sampling"), "record_steps"), "add_member")
+    recorder = kind(config, spec)
+    training = open_training(config, spec, f"{recorder.run_id}.{recorder.attempt}", InlineTransport())
+    files = mortal(CheckpointFiles, "save")(recorder.dir, long=training.log_rows, seconds=0.0)
+    try:
+        TrainingDriver(config, recorder, NullReporter(), training, files).train_members()
+    finally:
+        recorder.close("FINISHED")
     return root / name
 
 
@@ -165,7 +155,9 @@ def test_another_seed_gives_another_population(whole: Path, root: Path) -> None:
     assert weights(other)[0] != weights(whole)[0]
 
 
-@pytest.mark.parametrize("die_at", ["record:3", "record_steps:2", "record_steps:5", "save:2", "add_member:2"])
+@pytest.mark.parametrize(
+    "die_at", ["record_sampling:3", "record_steps:2", "record_steps:5", "save:2", "save:4", "add_member:2"]
+)
 def test_interrupted_anywhere_the_run_ends_the_same(whole: Path, root: Path, die_at: str) -> None:
     name = die_at.replace(":", "-")
     with pytest.raises(Killed):
@@ -198,27 +190,42 @@ def test_rendezvous_and_no_cross_play_pressure(root: Path) -> None:
     assert Ledger(run / "ledger.jsonl").steps(3, Kind.XP) > 0
 
 
-def driver(members: int, **changes: Any) -> Any:
-    base = ["method=xpm_sim", "scale=smoke", *(f"xpm_sim.{name}={value}" for name, value in changes.items())]
-    known = {member: {} for member in range(1, members + 1)}
-    return SimpleNamespace(config=RunConfig.parse(compose(base)), members=known)
-
-
 def test_partners_take_turns_in_both_seats() -> None:
-    member = Member(driver(3, episodes_xp=4), 4)
-    seen: Counter[tuple[int, int]] = Counter()
-    for member.round in range(3):
-        matches = member._teams()
+    config, pairs = XpmSimConfig(episodes_sp=2, episodes_xp=4), seatings(4, [1, 2, 3], 3004)
+    met: Counter[tuple[int, int]] = Counter()
+    for number in range(3):
+        matches = round_matches(config, 4, pairs, number)
         assert (matches[0].members, matches[0].envs) == ((4, 4), 2)
         assert sum(match.envs for match in matches[1:]) == 4
-        seen.update({match.members: match.envs for match in matches[1:]})
-    assert seen == {pair: 2 for k in (1, 2, 3) for pair in ((4, k), (k, 4))}
+        met.update({match.members: match.envs for match in matches[1:]})
+    assert met == {pair: 2 for k in (1, 2, 3) for pair in ((4, k), (k, 4))}
 
 
 def test_more_episodes_than_pairs_are_shared_evenly() -> None:
-    matches = Member(driver(1, episodes_xp=5), 2)._teams()
-    assert {match.members: match.envs for match in matches[1:]} == {(2, 1): 3, (1, 2): 2}
-    assert len(Member(driver(0), 1)._teams()) == 1
+    config, pairs = XpmSimConfig(episodes_xp=5), seatings(2, [1], 3002)
+    shares = {match.members: match.envs for match in round_matches(config, 2, pairs, 0)[1:]}
+    assert shares == dict(zip(pairs, (3, 2), strict=True)) and set(pairs) == {(2, 1), (1, 2)}
+    assert len(round_matches(config, 1, seatings(1, [], 3001), 0)) == 1
+
+
+def test_the_last_round_has_the_updates_that_are_left() -> None:
+    config = XpmSimConfig(updates=7, updates_per_round=3)
+    assert [updates_of_round(config, done) for done in (0, 3, 6, 7)] == [3, 3, 1, 0]
+
+
+def test_scores_of_partners_that_a_round_did_not_meet_stay() -> None:
+    episodes = [Episode(Kind.SP, (3, 3), score, 0.0) for score in (4.0, 6.0)]
+    episodes += [Episode(Kind.XP, (3, 1), 2.0, 0.0), Episode(Kind.XP, (1, 3), 3.0, 0.0)]
+    assert score_round({}, episodes[:2], []) == {"sp": 5.0}
+    scores = score_round({"sp": 1.0, "xp/1": 9.0, "xp/2": 1.5, "xp": 9.0}, episodes, [1, 2])
+    assert scores == {"sp": 5.0, "xp/1": 2.5, "xp/2": 1.5, "xp": 2.5}
+
+
+def test_progress_is_read_by_name() -> None:
+    progress = MemberProgress(rounds=2, updates=10, steps=80, simulated=400, scores={"sp": 1.5})
+    assert MemberProgress.from_state(json.loads(json.dumps(asdict(progress)))) == progress
+    with pytest.raises(KeyError):
+        MemberProgress.from_state({"rounds": 1})
 
 
 def test_buffers_that_cannot_hold_a_round_are_refused(root: Path) -> None:

@@ -22,9 +22,10 @@ from popgen.config.sections import ClusterConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.mappo.algorithm import Mappo, MappoConfig
-from popgen.methods.mappo.objective import Objective
+from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.training_job import Job, policy_config
 from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
+from popgen.methods.transport import InlineTransport, Transport
 from popgen.nets.weights import Weights, prefixed
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import Kind
@@ -233,3 +234,21 @@ class RllibTraining:
         if self._algorithm is not None:
             self._algorithm.stop()
             self._algorithm = None
+
+
+def open_rllib(
+    config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport, objective: Objective
+) -> RllibTraining:
+    """The training of an objective; RLlib starts its own workers.
+
+    Raises:
+        UserError: everything is to be in this process, which RLlib cannot do without Ray.
+    """
+    if isinstance(transport, InlineTransport):
+        raise UserError("run.transport", "is inline, but RLlib needs Ray", "set run.transport=ray")
+    return RllibTraining(config, spec, attempt, objective)
+
+
+def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
+    """MAPPO alone: members differ by their seeds. See `popgen.methods.transport.OpenTraining`."""
+    return open_rllib(config, spec, attempt, transport, SELF_PLAY)

@@ -46,6 +46,7 @@ class XpmSimTraining:
 
     learners = ("learner",)
     log_rows = 1  # no log: the learner's state holds its buffers
+    begins_workers = False
 
     def __init__(self, config: RunConfig, spec: EnvSpec, attempt: str, workers: Workers) -> None:
         self.run, self.config, self.spec, self.workers = config.run, config.xpm_sim, spec, workers
