@@ -3,42 +3,56 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# One worker of pytest-xdist for all that starts Ray, the other for the rest.
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
 export RAY_USAGE_STATS_ENABLED := 0
 export MLFLOW_DISABLE_TELEMETRY := true
 
-.PHONY: chaos demo test lint format oracle bench install clean
+.PHONY: bench chaos clean demo docs format help install lint oracle test test-fast types
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 	$(BIN)/popgen run env=overcooked/cramped_room scale=demo seed=1
 
-test: install
-	$(BIN)/python -m pytest
+test: install  ## all tests
+	$(PYTEST)
 
-lint: install
+test-fast: install  ## the tests that start neither Ray nor a process of popgen: 90 seconds
+	$(PYTEST) -m "not ray"
+
+lint: install docs types  ## style, types, documentation
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-format: install
+types: install  ## pyright: basic, strict where pyproject.toml says so
+	$(BIN)/basedpyright
+
+docs: install  ## the documentation as a site, in site/; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+format: install  ## rewrite the code as `make lint` wants it
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 oracle: install  ## every layout and cooking mode against overcooked_ai, 20,000 steps each
 	$(BIN)/python -m pytest tests/envs -k oracle
 
-bench: install
+bench: install  ## steps per second of the simulator
 	$(BIN)/popgen bench env --json
 
 chaos: install  ## random faults on small runs: each must end as if nothing had happened
 	$(BIN)/python tests/chaos/campaign.py
 
-install: $(STAMP)
+install: $(STAMP)  ## the virtual environment
 
 # Runs again only when the dependencies may have changed; the code itself is installed in place.
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,docs]'
 	touch $@
 
-clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache build dist *.egg-info
+clean:  ## remove what is built
+	rm -rf $(VENV) .pytest_cache .ruff_cache build dist site *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
