@@ -143,7 +143,7 @@ def cluster() -> Iterator[Cluster]:
     for name in PARTS:
         path = ROOT / name
         if path.is_dir():
-            shutil.copytree(path, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(path, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(path, source / name)
     for left in ("runs/other/config.json", ".venv/bin/python"):  # what must not travel

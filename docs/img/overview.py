@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-WIDTH, HEIGHT = 860, 300
+WIDTH, HEIGHT = 860, 280
 BOXES = {  # name -> left, top, width, height, colour, lines of text
     "env": (20, 110, 150, 70, "#dbe9f6", ("environment", "few real episodes")),
     "replay": (215, 110, 130, 70, "#dbe9f6", ("buffers", "B_SP and B_XP")),
@@ -19,9 +19,9 @@ ARROWS = (
     ("M170 145 H213", "", 0, 0),
     ("M345 135 H367 V65 H388", "", 0, 0),
     ("M465 100 V188", "dynamics", 472, 148),
-    ("M345 155 H367 V225 H388", "start states", 272, 243),
+    ("M345 155 H367 V225 H388", "start states", 296, 205),
     ("M540 225 H562 V155 H583", "", 0, 0),
-    ("M640 110 V14 H95 V108", "plays with itself and with members 1 .. m-1", 190, 9),
+    ("M640 110 V22 H95 V108", "plays with itself and with members 1 .. m-1", 110, 16),
 )
 CELL, LEFT, TOP = 36, 735, 92
 
