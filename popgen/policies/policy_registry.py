@@ -17,6 +17,7 @@ POLICIES: dict[str, str] = {
     "idle": "popgen.policies.simple_policies:IdlePolicy",
     "feed_forward": "popgen.policies.feed_forward_policy:FeedForwardPolicy",
     "encoded": "popgen.methods.xpm_sim.encoded_policy:EncodedPolicy",
+    "human_clone": "popgen.humans.clone_policy:ClonePolicy",
 }
 """kind -> `module:class`; the only classes that a loaded artefact can name."""
 

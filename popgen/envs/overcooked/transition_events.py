@@ -157,7 +157,7 @@ def _interact(row, p, table, auto):
             row[slot], row[slot + 1] = 0, 0
         elif event == START_POT:
             row[slot + 1] = 1 + table[COOK, row[slot]]
-        elif event == POTTED_ONION or event == POTTED_TOMATO:
+        elif event in (POTTED_ONION, POTTED_TOMATO):
             row[slot] = table[ADD_ONION if held == ONION else ADD_TOMATO, row[slot]]
         return event
     if kind == COUNTER:
