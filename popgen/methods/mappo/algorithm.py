@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import ray
 from ray.exceptions import RayActorError
@@ -254,3 +254,8 @@ class Mappo(PPO):
                 raise ValueError(str(error).strip().rpartition("\n")[2]) from None
         self.played.load_state(state["played"])
         self.rounds = int(state["rounds"])
+
+
+def build_algorithm(job: Job, spec: EnvSpec, cluster: ClusterConfig) -> Mappo:
+    """RLlib's learner and runners for a job."""
+    return cast(Mappo, MappoConfig.of(job, spec, cluster).build_algo())

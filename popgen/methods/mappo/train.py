@@ -21,7 +21,7 @@ from popgen.config.run_config import RunConfig
 from popgen.config.sections import ClusterConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
-from popgen.methods.mappo.algorithm import Mappo, MappoConfig
+from popgen.methods.mappo.algorithm import Mappo, build_algorithm
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.training_job import Job, policy_config
 from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
@@ -134,7 +134,7 @@ class RllibTraining:
     def _report_iteration(self) -> Loop:
         """An iteration's step counts, then each member's figures."""
         report, ppo, now = self.algorithm.report, self.config.ppo, self.progress
-        counts = []
+        counts: list[StepCount] = []
         for number, one in enumerate(report.counted, now.sequence):
             name = f"runner{one.runner}.{self.attempt}"
             counts.append(StepCount(one.owner, one.kind, name, number, one.steps, one.episodes, one.score))
@@ -169,7 +169,7 @@ class RllibTraining:
 
     def _finish_member(self, member: int) -> TrainedMember:
         """The actor as it is saved, its critics beside it."""
-        algorithm, seconds = self.algorithm, self._seconds()
+        algorithm, seconds = self.algorithm, self._count_seconds()
         policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), algorithm.actors()[member], self.spec)
         self.archive[member] = policy.weights()
         scores = algorithm.scores(member)
@@ -186,7 +186,7 @@ class RllibTraining:
             note=f"member {member}: {parts} {self.spec.score_name} in training, {steps}, {seconds / 60:.1f} min",
         )
 
-    def _seconds(self) -> float:
+    def _count_seconds(self) -> float:
         return self.progress.seconds + time.time() - self.began
 
     # ---- members and checkpoints ---------------------------------------------------------------------------------
@@ -210,13 +210,13 @@ class RllibTraining:
         self.learning = learning_members(self.objective, self.config, first)
         self.progress = GroupProgress(self.progress.sequence, steps=dict.fromkeys(self.learning, 0))
         job = training_job(self.objective, self.config, self.learning, self.archive)
-        self._algorithm = MappoConfig.of(job, self.spec, self.config.cluster).build_algo()
+        self._algorithm = build_algorithm(job, self.spec, self.config.cluster)
         self.began = time.time()
         return self.learning
 
     def checkpoint(self) -> State:
         """See `Training`."""
-        progress = asdict(self.progress) | {"seconds": self._seconds()}
+        progress = asdict(self.progress) | {"seconds": self._count_seconds()}
         progress["steps"] = {str(member): steps for member, steps in self.progress.steps.items()}
         return {"algorithm": self.algorithm.snapshot(), "progress": progress}
 

@@ -78,7 +78,7 @@ class XpmSimTraining:
             counted = tuple(replace(one, segments={}) for one in sampled)  # a checkpoint needs no log of segments
             now.steps += sum(one.collected.steps for one in sampled)
             yield Progress(self.member, now.steps, sampled=counted)
-            self._judge([episode for one in sampled for episode in one.collected.episodes])
+            self._score_episodes([episode for one in sampled for episode in one.collected.episodes])
             ingested = self.workers.ingest([one.segments for one in sampled], self.strength.scores())
             learned = (learning or self.workers.learn(updates)).result()
             ingested.result()
@@ -93,7 +93,7 @@ class XpmSimTraining:
         matches = round_matches(self.config, self.member, self.pairs, number)
         return self.workers.play(matches, policies, self.seed * 1000 + number, horizon)
 
-    def _judge(self, episodes: list[Episode]) -> None:
+    def _score_episodes(self, episodes: list[Episode]) -> None:
         """Scores of the round, and each partner's latest return in cross-play."""
         events = rewards_events(self.spec)
         for partner in self.partners:
@@ -110,10 +110,18 @@ class XpmSimTraining:
         counted = self._count_simulated("simulator", now.rounds, learned.steps, learned.trajectories)
         self.acting = learned.acting
         now.rounds, now.updates = now.rounds + 1, now.updates + updates
-        shown = {"steps": now.steps, self.spec.score_name: round(scores["sp"], 2)}
-        shown |= {"XP": round(scores["xp"], 2)} if self.pairs else {}
-        place = {"done": now.updates, "shown": shown, "number": now.rounds}
-        return Round(self.member, now.steps, figures, counted=(counted,), **place)
+        shown: dict[str, float] = {"steps": now.steps, self.spec.score_name: round(scores["sp"], 2)}
+        if self.pairs:
+            shown["XP"] = round(scores["xp"], 2)
+        return Round(
+            self.member,
+            now.steps,
+            figures,
+            counted=(counted,),
+            done=now.updates,
+            shown=shown,
+            number=now.rounds,
+        )
 
     def _count_simulated(self, name: str, sequence: int, steps: int, trajectories: int) -> StepCount:
         self.progress.simulated += steps
@@ -133,10 +141,10 @@ class XpmSimTraining:
         policy.load(weights)
         extra = {name: now.scores[name] for name in ("sp", "xp") if name in now.scores}
         extra |= {"seconds": round(seconds, 1), "simulated_steps": now.simulated, "check": check.figures}
-        note = self._describe(check.figures, seconds)
+        note = self._describe_member(check.figures, seconds)
         yield TrainedMember(self.member, policy, critics, self.seed, extra, {"encoder": self.encoder}, note)
 
-    def _describe(self, check: dict[str, float], seconds: float) -> str:
+    def _describe_member(self, check: dict[str, float], seconds: float) -> str:
         now, scores = self.progress, self.progress.scores
         parts = [f"SP {scores['sp']:.2f}"] + ([f"strongest XP {scores['xp']:.2f}"] if "xp" in scores else [])
         parts[-1] += f" {self.spec.score_name} in training"
