@@ -1,7 +1,7 @@
 """Damaged, foreign and hostile configs, populations and checkpoints: one line each, nothing run, nothing overwritten.
 
 What a run of `scale=smoke` left when it died between two iterations is damaged in one way after the other; then it is
-continued (or its population shown) as a user would. No process but this one takes part: the actors are objects.
+continued (or its population shown) as a user would. No process but this one takes part.
 """
 
 from __future__ import annotations
@@ -12,27 +12,24 @@ import os
 import pickle
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import ray
-from support.local_crew import LocalCrew
 
 from popgen import cli
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.pipelines import population as main_job
-from popgen.pipelines import xpm_wm_driver as xpm_wm
 from popgen.progress import NullReporter
 from popgen.runs.checkpoints import Checkpoints
 from popgen.runs.state_files import ARRAYS, VALUES, load_state, save_state
 
 RUN = (
     *("scale=smoke", "tracking=off", "population.size=2", "env.params.horizon=20", "seed=3", "run.root=runs"),
-    *("run.id=r", "phase1.max_steps=2600", "evaluation.episodes=1"),
+    *("run.id=r", "run.transport=inline", "phase1.max_steps=2600", "evaluation.episodes=1"),
 )
 OF_ATTEMPTS = {"attempts.txt", "run.lock", "run.log", "state.json"}  # what each attempt adds to, damaged run or not
 HEADER = b'{"a":' + b"[" * 50_000
@@ -50,19 +47,7 @@ class Died(RuntimeError):
 
 
 @pytest.fixture(scope="module")
-def in_this_process() -> Iterator[None]:
-    """Actors are objects of this process, and references to objects are the objects."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray, "get", lambda given, **_: given)
-        patch.setattr(ray, "put", lambda value: value)
-        patch.setattr(ray, "wait", lambda references, **_: (references, []))
-        patch.setattr(main_job, "start_ray", lambda config: False)
-        patch.setattr(xpm_wm, "Crew", LocalCrew)
-        yield
-
-
-@pytest.fixture(scope="module")
-def broken_off(in_this_process: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def broken_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with runs/r, which died in member 1, after a checkpoint between two rounds."""
     folder = tmp_path_factory.mktemp("broken_off")
     saved = Checkpoints.save
@@ -278,10 +263,10 @@ CASES: dict[str, tuple[Callable[[Path], Any], str]] = {
         in_state(lambda s: s["model"]["learner"]["optimiser"].pop("0.exp_avg")), "checkpoint"
     ),
     "checkpoint with a policy of other sizes": (
-        in_state(lambda s: shorten(s["first_member"]["published"]["acting"])), "checkpoint"
+        in_state(lambda s: shorten(s["progress"]["published"]["acting"])), "checkpoint"
     ),
     "checkpoint whose counters are text": (
-        in_state(lambda s: s["first_member"].update(counters="many")), "checkpoint"
+        in_state(lambda s: s["progress"].update(rounds="many")), "checkpoint"
     ),
     "checkpoint with half a generator": (
         in_state(lambda s: s["agent"].update(generator=s["agent"]["generator"][:99])), "checkpoint"

@@ -14,22 +14,23 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
-from support.local_crew import LocalCrew
 
-from popgen.actors.sampler_actor import Collected
+from popgen.actors.checkpoint_writer import CheckpointFiles
+from popgen.actors.xpm_wm_workers import open_training
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.methods.training import Collected, Round, TrainedMember
+from popgen.methods.transport import InlineTransport
+from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress
 from popgen.methods.xpm_wm.replay import KIND_CODE
+from popgen.methods.xpm_wm.train import FirstMember, LaterMember
 from popgen.pipelines import population as main_job
-from popgen.pipelines import xpm_wm_driver as pipeline
-from popgen.pipelines.crew import Crew
-from popgen.pipelines.later_member import LaterMember
 from popgen.pipelines.population import run_population
+from popgen.play.partner_strength import PartnerStrength
 from popgen.population import Population, load_population
 from popgen.progress import NullReporter
-from popgen.runs.checkpoints import Checkpoints
 from popgen.runs.ledger import Ledger
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.state_files import load_state
@@ -70,9 +71,10 @@ class Killed(RuntimeError):
     """Injected where a driver could be killed."""
 
 
-def kill(crew: Crew, who: str) -> None:
+def kill(work: Any, who: str) -> None:
     """kill -9 of an actor's process."""
-    handle = crew.players.samplers[0] if who == "sampler" else getattr(crew, who)
+    workers = {"sampler": work.pool.samplers[0], "model": work.model, "agent": work.agent, **work.replays}
+    handle = workers[who].handle
     os.kill(ray.get(handle.__ray_call__.remote(lambda actor: os.getpid())), signal.SIGKILL)
 
 
@@ -96,10 +98,10 @@ def launch(
     die_at: METHOD:N of the recorder or the checkpoints; the run dies at the beginning of the N-th call of it.
     kills: METHOD:N -> the actor whose process is killed then.
     """
-    config = smoke(root, name, *overrides)
+    config = smoke(root, name, *overrides, f"run.transport={'inline' if local else 'ray'}")
     collected: list[tuple[int, Collected]] = []
     calls: Counter[str] = Counter()
-    crews: list[Any] = []
+    trainings: list[Any] = []
 
     def called(name: str) -> None:
         calls[name] += 1
@@ -107,33 +109,33 @@ def launch(
         if now == die_at:
             raise Killed(die_at)
         if kills and now in kills:
-            kill(crews[-1], kills[now])
+            kill(trainings[-1].work, kills[now])
 
-    class Hired(pipeline.Crew):
-        @staticmethod
-        def hire(*given: Any) -> Any:
-            crews.append((LocalCrew if local else Crew).hire(*given))
-            return crews[-1]
+    open_training = main_job.open_training
+
+    def opened(*arguments: Any) -> Any:
+        trainings.append(open_training(*arguments))
+        return trainings[-1]
 
     class Listening(RunRecorder):
-        def record(self, member: int, said: Collected) -> None:
+        def record_sampling(self, member: int, sampled: Collected) -> None:
             called("record")
-            collected.append((member, said))
-            super().record(member, said)
+            collected.append((member, sampled))
+            super().record_sampling(member, sampled)
 
         def add_member(self, *given: Any, **named: Any) -> None:
             called("add_member")
             super().add_member(*given, **named)
 
-    class Mortal(Checkpoints):
+    class Mortal(CheckpointFiles):
         def save(self, *given: Any) -> None:
             called("save")
             super().save(*given)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main_job, "RunRecorder", Listening)
-        patch.setattr(pipeline, "Checkpoints", Mortal)
-        patch.setattr(pipeline, "Crew", Hired)
+        patch.setattr(main_job, "CheckpointFiles", Mortal)
+        patch.setattr(main_job, "open_training", opened)
         return Run(run_population(config, reporter=NullReporter()), collected)
 
 
@@ -302,6 +304,13 @@ def test_an_evaluation_that_is_done_again_counts_once(whole: Run, root: Path, mo
     assert launch(root, "evaluated").result["ledger"] == before  # and a run that is complete is left as it is
 
 
+def test_both_transports_give_the_same_weights(whole: Run, root: Path) -> None:
+    """Actors of Ray's, and objects of this process."""
+    inline = launch(root, "inline")
+    assert sha256s(inline) == sha256s(whole) and inline.ledger() == whole.ledger()
+    assert inline.result["matrix"] == whole.result["matrix"]
+
+
 def test_a_ring_that_is_full_is_restored_from_a_whole_copy(cluster: None, root: Path) -> None:
     small = ("replay.capacity=1700", "population.size=1")
     unbroken = launch(root, "unbroken_ring", *small)
@@ -342,7 +351,7 @@ def test_a_checkpoint_waits_for_its_time(cluster: None, root: Path) -> None:
     with pytest.raises(Killed):
         launch(root, "seldom", "run.checkpoint_seconds=3600", die_at="record:4")
     state = load_state(root / "seldom" / "checkpoints" / "progress_000001")
-    assert state["first_member"]["counters"][0] == 0  # that before the rounds
+    assert state["progress"]["rounds"] == 0  # that before the rounds
 
 
 def test_a_run_id_belongs_to_one_configuration(whole: Run, root: Path) -> None:
@@ -359,57 +368,73 @@ def test_a_run_can_go_on_from_a_member_of_another(whole: Run, continued: Run) ->
     assert continued.result["ledger"]["2"] == whole.result["ledger"]["2"]
 
 
-def test_a_run_that_goes_on_from_another_can_be_interrupted_before_its_first_own_member(
-    whole: Run, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_continues_another_can_be_interrupted_before_its_first_own_member(whole: Run, root: Path) -> None:
     """Until there is a checkpoint of its own, the other run's counts."""
-    loaded: list[Any] = []
-    actor = SimpleNamespace(load_state=SimpleNamespace(remote=loaded.append))
-    crew = SimpleNamespace(replay_sp=actor, replay_xp=actor, model=actor)
-    monkeypatch.setattr(pipeline.Crew, "hire", lambda config, attempt: crew)
-    config = smoke(root, "early", f"population.init_from={whole.dir}", "population.init_members=1")
-    for attempt in (1, 2):
-        loaded.clear()
-        recorder = RunRecorder(config, whole.population.spec)
-        driver = pipeline.XpmWm(config, whole.population.spec, recorder, NullReporter())
-        with monkeypatch.context() as patch:
-            patch.setattr(ray, "get", lambda references: references)
-            known, base, saved = driver._resume()
-            assert (known, base, saved) == (1, whole.dir / "checkpoints" / "member_001", None)
-        assert recorder.attempt == attempt and len(recorder.population) == 1 and len(loaded) == 3
-        assert driver.members.keys() == {1}
+    more = (f"population.init_from={whole.dir}", "population.init_members=1")
+    with pytest.raises(Killed):
+        launch(root, "early", *more, die_at="record:1")
+    assert len(load_population(root / "early" / "population")) == 1
+    run = launch(root, "early", *more)
+    assert sha256s(run) == sha256s(whole) and {member for member, _ in run.collected} == {2}
 
 
-@pytest.mark.parametrize(("steps", "rounds"), [("null", 7), ("1000000", 7), ("800", 5), ("799", 4), ("1", 1)])
-def test_rounds_of_a_later_member_end_with_its_steps(root: Path, steps: str, rounds: int) -> None:
-    config = smoke(root, "unused", "phase2.rounds=7", f"phase2.max_steps={steps}")
+def later_member(root: Path, member: int, *overrides: str) -> LaterMember:
+    config = smoke(root, "unused", *overrides)
     spec = make_env(config.env.name, 1, **config.env.params).spec
-    driver = SimpleNamespace(config=config, spec=spec, members={1: {}})
-    assert LaterMember(driver, 2, seed=0).rounds() == rounds  # (2 + 2) episodes of 40 steps each
-
-
-def test_only_a_weak_member_plays_further_rounds(root: Path) -> None:
-    config = smoke(root, "unused", "phase2.rounds=2", "phase2.max_rounds=4", "phase2.target_score=5")
-    driver = SimpleNamespace(config=config, spec=make_env(config.env.name, 1).spec, members={1: {}})
-    member = LaterMember(driver, 2, seed=0)
-    assert member.rounds() == 4
-    for sp, wanted in ((4.9, 4), (5.0, 2)):
-        member.best = SimpleNamespace(sp=sp)
-        played = []
-        for member.number in range(5):
-            if not member._goes_on(member.rounds()):
-                break
-            played.append(member.number)
-        assert len(played) == wanted
+    archive: Any = dict.fromkeys(range(1, member))
+    progress = LaterMemberProgress(PartnerStrength("max_window"))
+    work: Any = None  # nothing is asked of it
+    return LaterMember(work, config, spec, member, 0, archive, progress)
 
 
 def test_every_partner_is_met_in_both_seats(root: Path) -> None:
-    config = smoke(root, "unused", "phase2.episodes_xp=2", "phase2.rounds=9", "phase2.max_steps=640")
-    spec = make_env(config.env.name, 1, **config.env.params).spec
-    driver = SimpleNamespace(config=config, spec=spec, members={1: {}, 2: {}, 3: {}})
-    later = LaterMember(driver, 4, seed=0)
+    later = later_member(root, 4, "phase2.episodes_xp=2", "phase2.rounds=9", "phase2.max_steps=640")
     assert set(later.pairs) == {(4, 1), (1, 4), (4, 2), (2, 4), (4, 3), (3, 4)}
-    assert later.episodes_xp == 6 and later.rounds() == 640 // ((2 + 6) * HORIZON)
+    assert later.episodes_xp == 6 and later.most_rounds == 640 // ((2 + 6) * HORIZON)
+
+
+@pytest.mark.parametrize(
+    ("event_starts", "plays", "chosen"), [("playing", False, False), ("playing", True, True), ("always", False, True)]
+)
+def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
+    root: Path, event_starts: str, plays: bool, chosen: bool
+) -> None:
+    config = smoke(root, "unused", f"phase1.event_starts={event_starts}")
+    asked: list[tuple[Any, ...]] = []
+    work: Any = SimpleNamespace(update_world_model=lambda *arguments: asked.append(arguments))
+    progress = FirstMemberProgress(16, plays=plays)
+    spec = make_env(config.env.name, 1).spec
+    FirstMember(work, config, spec, 0, progress).update_world_model(7)
+    assert asked == [(7, config.agent.starts_sp, chosen)]
+
+
+def test_every_look_at_the_last_policy_has_fresh_episodes(root: Path) -> None:
+    """So has the play between two looks."""
+    config = smoke(root, "unused")
+    seeds: list[tuple[int, bool]] = []
+    work: Any = SimpleNamespace(start_episodes=lambda matches, policies, seed, stagger: seeds.append((seed, stagger)))
+    weights: Any = SimpleNamespace(acting=None)
+    first = FirstMember(work, config, make_env(config.env.name, 1).spec, 3001, FirstMemberProgress(16))
+    first.progress.published = weights
+    first.start_self_play()
+    for first.progress.confirmations in (1, 2):
+        first.start_self_play(stagger=False)
+        first.start_self_play()
+    assert [stagger for _, stagger in seeds] == [True, False, True, False, True]
+    assert len({seed for seed, _ in seeds}) == 5
+
+
+def test_a_loop_runs_without_anything_written(root: Path) -> None:
+    """As in a notebook: workers in this process, records one after the other."""
+    config = smoke(root, "notebook", "population.size=1")
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    training = open_training(config, spec, "notebook.1", InlineTransport())
+    assert training.begin(1) == (1,)
+    records = list(training.train())
+    rounds = [record for record in records if isinstance(record, Round)]
+    assert [record.number for record in rounds] == list(range(len(rounds))) and rounds[-1].at_rest
+    (trained,) = (record for record in records if isinstance(record, TrainedMember))
+    assert trained.member == 1 and trained.policy.weights() and not (root / "notebook").exists()
 
 
 def test_overlapping_work_is_counted_exactly(overlapped: Run) -> None:

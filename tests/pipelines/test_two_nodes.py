@@ -13,12 +13,10 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from popgen.actors.sampler_actor import Collected
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
+from popgen.methods.training import Collected
 from popgen.pipelines import population as main_job
-from popgen.pipelines import xpm_wm_driver as xpm_wm
-from popgen.pipelines.crew import Crew
 from popgen.pipelines.population import run_population
 from popgen.population import load_population
 from popgen.progress import NullReporter
@@ -42,29 +40,28 @@ def nodes() -> Iterator[Cluster]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def run(cluster: Cluster, root: Path, name: str, at_record: Callable[[int, Crew], None]) -> Path:
+def run(cluster: Cluster, root: Path, name: str, at_record: Callable[[int, Any], None]) -> Path:
     """A run of one member with two samplers; `at_record` is called with the number of each round taken in, before it
     is. Its folder."""
     overrides = ["scale=smoke", "tracking=off", "population.size=1", "env.params.horizon=40", "seed=3"]
     overrides += [f"cluster.address={cluster.address}", "cluster.resources.far=1", "cluster.samplers=2"]
     overrides += ["evaluation.episodes=1", f"run.root={root}", f"run.id={name}"]
-    crews: list[Crew] = []
+    trainings: list[Any] = []
     calls: list[int] = []
+    open_training = main_job.open_training
 
-    class Hired(Crew):
-        @staticmethod
-        def hire(*given: Any) -> Any:
-            crews.append(Crew.hire(*given))
-            return crews[-1]
+    def opened(*arguments: Any) -> Any:
+        trainings.append(open_training(*arguments))
+        return trainings[-1]
 
     class Listening(RunRecorder):
-        def record(self, member: int, said: Collected) -> None:
+        def record_sampling(self, member: int, sampled: Collected) -> None:
             calls.append(member)
-            at_record(len(calls), crews[-1])
-            super().record(member, said)
+            at_record(len(calls), trainings[-1].work)
+            super().record_sampling(member, sampled)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(xpm_wm, "Crew", Hired)
+        patch.setattr(main_job, "open_training", opened)
         patch.setattr(main_job, "RunRecorder", Listening)
         run_population(RunConfig.parse(compose(overrides)), reporter=NullReporter())
     return root / name
@@ -85,13 +82,13 @@ def test_a_run_spreads_over_nodes_and_outlives_one(nodes: Cluster, tmp_path: Pat
     """All actors are on the second node. It is killed in the third round; another one comes."""
     placed: set[str] = set()
 
-    def look(call: int, crew: Crew) -> None:
+    def look(call: int, work: Any) -> None:
         if call == 1:
-            actors = (*crew.players.samplers, crew.replay_sp, crew.replay_xp, crew.model, crew.agent)
-            placed.update(node_of(actor) for actor in actors)
+            workers = (*work.pool.samplers, *work.replays.values(), work.model, work.agent)
+            placed.update(node_of(worker.handle) for worker in workers)
             placed.add(f"driver {ray.get_runtime_context().get_node_id()}")
 
-    def strike(call: int, crew: Crew) -> None:
+    def strike(call: int, work: Any) -> None:
         if call == 5:
             (far,) = nodes.worker_nodes
             nodes.remove_node(far, allow_graceful=False)

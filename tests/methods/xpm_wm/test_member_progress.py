@@ -1,0 +1,168 @@
+"""The rules that end a phase, on progress records alone; records go to a checkpoint and come back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from popgen.actors.checkpoint_writer import resolve_handles
+from popgen.methods.transport import InlineTransport, Ready
+from popgen.methods.xpm_wm import member_progress as rules
+from popgen.methods.xpm_wm.config import Phase1Config, Phase2Config
+from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
+from popgen.methods.xpm_wm.start_states import Starts
+from popgen.play.partner_strength import PartnerStrength
+
+AFTER = 0.5
+
+
+def weights(value: float) -> MemberWeights:
+    return MemberWeights(*(Ready({"w": np.full(2, value)}) for _ in range(3)))
+
+
+LATEST, PLAYED = weights(1.0), weights(2.0)
+
+
+def member() -> FirstMemberProgress:
+    """Its window is 16 episodes; no step has been taken yet."""
+    return FirstMemberProgress(16, played=PLAYED, published=LATEST)
+
+
+def play(progress: FirstMemberProgress, phase: Phase1Config, *scores: float) -> None:
+    progress.add_episodes(scores, scores)
+    rules.keep_best(progress, phase, AFTER)
+
+
+def test_patience_begins_when_there_is_a_window_to_judge_by() -> None:
+    first, phase = member(), Phase1Config(patience=3, target_score=9.0)
+    for _ in range(15):
+        play(first, phase, 1.0)
+        assert not rules.should_stop(first, phase) and first.since_best == 0 and first.best is None
+    for waited in range(3):
+        play(first, phase, 1.0)
+        assert first.since_best == waited and not rules.should_stop(first, phase)
+    play(first, phase, 1.0)
+    assert first.since_best == 3 and rules.should_stop(first, phase)
+    play(first, phase, *[2.0] * 16)
+    assert first.since_best == 0 and not rules.should_stop(first, phase)
+
+
+def test_the_target_needs_a_whole_window_and_the_budget_does_not() -> None:
+    first, phase = member(), Phase1Config(target_score=5.0, max_steps=100)
+    first.add_episodes([8.0] * 15, [])
+    assert not rules.should_stop(first, phase)
+    first.add_episodes([8.0], [])
+    assert rules.should_stop(first, phase) and rules.reached_target(first, phase)
+    first = member()
+    first.steps = 100
+    assert rules.should_stop(first, phase) and not rules.reached_target(first, phase)
+
+
+@pytest.mark.parametrize(("last", "wanted"), [(9.6, LATEST), (9.4, PLAYED)])
+def test_the_last_weights_are_taken_unless_those_that_played_best_were_better(
+    last: float, wanted: MemberWeights
+) -> None:
+    first, phase = member(), Phase1Config()
+    play(first, phase, *[10.0] * 16)
+    play(first, phase, *[last] * 16)
+    assert rules.choose_first(first).weights is wanted
+
+
+def test_without_a_whole_window_the_last_weights_are_all_there_is() -> None:
+    first, phase = member(), Phase1Config()
+    assert rules.choose_first(first) == Candidate(LATEST, 0.0, 0.0)
+    play(first, phase, 4.0, 2.0)
+    assert rules.choose_first(first) == Candidate(LATEST, 3.0, 0.0)
+
+
+def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_target() -> None:
+    first, phase = member(), Phase1Config(target_score=10.0)
+    play(first, phase, *[5.0] * 15)
+    assert not first.plays
+    play(first, phase, 4.0)
+    assert not first.plays  # 4.94 of 5
+    play(first, phase, 6.0)
+    assert first.plays
+    play(first, phase, *[0.0] * 16)
+    assert first.plays  # for good
+
+
+def test_the_last_policy_must_reach_the_target_by_itself() -> None:
+    """9.69 of 10 is too little, 9.7 enough; then it is taken although the best window was another's."""
+    phase = Phase1Config(target_score=10.0)
+    assert not rules.is_confirmed(9.69, phase) and rules.is_confirmed(9.7, phase)
+    first = member()
+    play(first, phase, *[20.0] * 16)
+    first.add_episodes([9.7] * 16, [])
+    assert rules.choose_first(first).weights is PLAYED
+    first.confirmed = True
+    assert rules.choose_first(first) == Candidate(LATEST, pytest.approx(9.7), 0.0)
+
+
+def test_a_confirmation_needs_room_in_the_budget() -> None:
+    first, phase = member(), Phase1Config(envs=16, max_steps=1000)
+    for steps, room in ((840, True), (841, False)):
+        first.steps = steps
+        assert rules.may_confirm(first, phase, horizon=10) is room
+
+
+def test_actor_and_critics_restart_once_and_only_if_wanted() -> None:
+    first = member()
+    assert not rules.restart_is_due(first, Phase1Config())
+    phase = Phase1Config(restart_after=100, restart_updates=5)
+    assert not rules.restart_is_due(first, phase)
+    first.steps = 100
+    assert rules.restart_is_due(first, phase)
+    first.restarted = True
+    assert not rules.restart_is_due(first, phase)
+
+
+@pytest.mark.parametrize(("steps", "rounds"), [(None, 7), (1_000_000, 7), (800, 5), (799, 4), (1, 1)])
+def test_rounds_of_a_later_member_end_with_its_steps(steps: int | None, rounds: int) -> None:
+    phase = Phase2Config(rounds=7, max_rounds=1, max_steps=steps, episodes_sp=2)
+    assert rules.most_rounds(phase, 2, horizon=40) == rounds  # (2 + 2) episodes of 40 steps each
+
+
+def test_only_a_weak_member_plays_further_rounds() -> None:
+    phase = Phase2Config(rounds=2, max_rounds=4, target_score=5.0)
+    assert rules.most_rounds(phase, 2, horizon=40) == 4
+    for sp, wanted in ((4.9, 4), (5.0, 2)):
+        progress = LaterMemberProgress(PartnerStrength("max_window"), best=Candidate(LATEST, sp, 0.0))
+        while rules.plays_on(progress, phase, 4):
+            progress.rounds += 1
+        assert progress.rounds == wanted
+
+
+def test_a_member_is_chosen_by_self_play_less_strongest_cross_play() -> None:
+    assert Candidate(LATEST, 5.0, 3.5).merit == 1.5
+
+
+def saved(progress: FirstMemberProgress | LaterMemberProgress) -> dict[str, Any]:
+    """As it is in a checkpoint: without handles."""
+    return resolve_handles(progress.to_state())
+
+
+def test_progress_of_member_1_comes_back_from_a_checkpoint() -> None:
+    first, phase = member(), Phase1Config(target_score=4.0)
+    play(first, phase, *map(float, range(20)))
+    first.rounds, first.confirmations, first.restarted, first.figures = 7, 2, True, {"model/loss": 0.5}
+    first.model, first.starts = Ready({"m": np.ones(3)}), Ready(Starts(*(np.zeros((2, 2)) for _ in range(4))))
+    again = FirstMemberProgress.from_state(saved(first), 16, 40, InlineTransport().put)
+    assert again.steps == 40 and again.played is None  # set when the first sampler starts
+    for name in ("rounds", "since_best", "confirmations", "restarted", "plays", "recent", "shaped", "figures"):
+        assert getattr(again, name) == getattr(first, name)
+    assert again.recent.maxlen == 16 and again.plays
+    assert again.best is not None and first.best is not None and again.best.sp == first.best.sp
+    assert np.array_equal(again.best.weights.acting.result()["w"], [2.0, 2.0])
+    assert isinstance(again.starts.result(), Starts)  # type: ignore[union-attr]
+
+
+def test_progress_of_a_later_member_comes_back_from_a_checkpoint() -> None:
+    later = LaterMemberProgress(PartnerStrength("max_window"), rounds=3, plays=True, best=Candidate(LATEST, 4.0, 1.0))
+    later.strength.add(1, [2.0, 4.0])
+    strength = PartnerStrength("max_window")
+    again = LaterMemberProgress.from_state(saved(later), strength, 160, InlineTransport().put)
+    assert (again.rounds, again.plays, again.steps) == (3, True, 160)
+    assert again.strength.scores() == {1: 3.0} and again.best is not None and again.best.merit == 3.0
