@@ -19,7 +19,7 @@ MARKED = 50
 """Calls after which the driver has the tracker write, and learns what has been written."""
 
 REVIVALS = 3
-"""Deaths of the tracker during one call of the driver's that are borne."""
+"""Tracker restarts tolerated per driver call."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class RemoteTracker:
         run_dir: Path,
         run_name: str,
         params: Mapping[str, Any],
-        resume: Mapping[str, Any] | None,
+        resume: Mapping[str, Any] | None = None,
     ) -> None:
         self._enabled, self._arguments = config.enabled, (config, str(run_dir), run_name, params)
         self._state: dict[str, Any] | None = None if resume is None else dict(resume)
@@ -75,15 +75,17 @@ class RemoteTracker:
         self._unwritten: list[tuple[Any, ...]] = []
         self._mark: tuple[Any, int] | None = None
 
-    def start(self) -> None:
-        """Create the actor; needs Ray.
+    def start(self, resume: Mapping[str, Any] | None = None) -> None:
+        """Create the actor; needs Ray. `resume` is what `flush` gave in an earlier attempt of another process.
 
         Raises:
             UserError: the store cannot be opened.
         """
         if self._enabled and self._actor is None:
+            if self._state is None and resume is not None:
+                self._state = dict(resume)
             self._open = True
-            self._hire()
+            self._create_actor()
 
     def forget(self) -> None:
         """Ray was shut down, and the actor with it: `start` makes another one."""
@@ -91,20 +93,20 @@ class RemoteTracker:
 
     def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
         """Metrics at `step` of the population (member None) or of one member."""
-        self._send("log", dict(metrics), step, member, int(time.time() * 1000))
+        self._send_call("log", dict(metrics), step, member, int(time.time() * 1000))
 
     def log_scaling(self, members: int, environment_steps: int) -> None:
         """Environment steps so far, with step = number of members."""
-        self._send("log_scaling", members, environment_steps)
+        self._send_call("log_scaling", members, environment_steps)
 
     def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
         """Copy a file or folder to the run's artefacts."""
-        self._send("log_artifact", str(path), folder)
+        self._send_call("log_artifact", str(path), folder)
 
     def flush(self) -> dict[str, Any]:
         """Everything so far is written; what a resumed run needs to go on in the same MLflow runs."""
         if self._open:
-            self._surely(self._written)
+            self._call_despite_failures(self._wait_written)
         return self._state or {}
 
     def finish(self, status: str) -> None:
@@ -113,17 +115,17 @@ class RemoteTracker:
             return
 
         def end() -> None:
-            self._written()
+            self._wait_written()
             ray.get(self._actor.call.remote("finish", status))
 
-        self._surely(end)
+        self._call_despite_failures(end)
         if self._actor is not None:
             ray.kill(self._actor)
         self._actor, self._open = None, False
 
     # ---- a tracker that may die ------------------------------------------------------------------------------------
 
-    def _hire(self) -> None:
+    def _create_actor(self) -> None:
         """An actor on the driver's node, whose files it reads, that gets all that may not have been written."""
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
         self._actor = ray.remote(TrackerActor).options(num_cpus=0, scheduling_strategy=here).remote()
@@ -132,7 +134,7 @@ class RemoteTracker:
         for call in self._unwritten:
             self._actor.call.remote(*call)
 
-    def _send(self, *call: Any) -> None:
+    def _send_call(self, *call: Any) -> None:
         if not self._open:
             return
         self._unwritten.append(call)
@@ -142,26 +144,26 @@ class RemoteTracker:
         if self._mark is None and len(self._unwritten) >= MARKED:
             self._mark = (self._actor.flush.remote(), len(self._unwritten))
         elif self._mark is not None and ray.wait([self._mark[0]], timeout=0)[0]:
-            self._surely(self._take_mark)
+            self._call_despite_failures(self._read_mark)
 
-    def _take_mark(self) -> None:
+    def _read_mark(self) -> None:
         if self._mark is not None:
             reference, count = self._mark
             self._state = ray.get(reference)
             del self._unwritten[:count]
             self._mark = None
 
-    def _written(self) -> None:
+    def _wait_written(self) -> None:
         self._state = ray.get(self._actor.flush.remote())
         self._unwritten.clear()
         self._mark = None
 
-    def _surely(self, act: Any) -> None:
+    def _call_despite_failures(self, act: Any) -> None:
         """Whatever happens to the actor. After too many deaths the run goes on without tracking."""
         for _ in range(REVIVALS):
             try:
                 if self._actor is None:
-                    self._hire()
+                    self._create_actor()
                 return act()
             except RayTaskError:
                 raise

@@ -16,6 +16,7 @@ from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.actors.local_ray import start_ray
 from popgen.actors.ray_transport import RayTransport
+from popgen.actors.tracker_actor import RemoteTracker
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
@@ -28,10 +29,11 @@ from popgen.progress import Reporter
 from popgen.reports.crossplay_report import to_dict, write_report
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_figures import write_run_figures
-from popgen.runs.directory import RunState
+from popgen.runs.directory import RunState, named, run_folder
+from popgen.runs.mlflow_tracker import LocalTracker
 from popgen.runs.monitoring import LoggingReporter, gauge
-from popgen.runs.recorder import RunRecorder, named, run_folder
-from popgen.runs.recovery import RetryBudget, death, first_line, nodes_alive, told, wait_for_room
+from popgen.runs.recorder import RunRecorder
+from popgen.runs.recovery import RetryBudget, actor_failure, first_line, nodes_alive, user_facing_error, wait_for_room
 from popgen.runs.storage import Mirror
 
 HALT_SECONDS = 30.0
@@ -76,7 +78,9 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         RunState.check_free(run_folder(config))  # the copy would be put in place of what its driver writes to
         if restored := Mirror(run_folder(config), config.run.storage).pull():
             reporter.note(restored)
-    recorder = RunRecorder(config, spec)
+    tracker_kind = RemoteTracker if config.run.transport == "ray" else LocalTracker
+    tracker = tracker_kind(config.tracking, run_folder(config), str(config.run.id), config.relevant())
+    recorder = RunRecorder(config, spec, tracker)
     reporter.note(f"run {recorder.run_id} in {recorder.dir}")
     job = PopulationJob(config, spec, recorder, reporter)
     status = "FAILED"
@@ -90,7 +94,7 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
     except FloatingPointError as error:  # of a learner; Ray wraps it in an error of both types
         raise UserError("training", str(getattr(error, "cause", error)), "lower the learning rates") from None
     except RayError as error:
-        if (known := told(error)) is error:
+        if (known := user_facing_error(error)) is error:
             raise
         raise known from None
     finally:
@@ -115,7 +119,7 @@ class PopulationJob:
             try:
                 return self._attempt()
             except Exception as error:
-                cause = death(error)
+                cause = actor_failure(error)
                 if cause is None:
                     raise
                 retries.spend(self.recorder.progress(), cause)
@@ -139,13 +143,12 @@ class PopulationJob:
     def _attempt(self) -> dict[str, Any]:
         recorder = self.recorder
         reporter = LoggingReporter(self.reporter, recorder.events)
-        recorder.tracker.start()
-        recorder.save_tracking()
-        self._train(recorder, reporter)
+        recorder.start_tracking()
+        self.train_members(recorder, reporter)
         result = finish(self.config, self.spec, recorder, reporter)
         return result | {"seconds": round(time.time() - self.began, 1)}
 
-    def _train(self, recorder: RunRecorder, reporter: Reporter) -> None:
+    def train_members(self, recorder: RunRecorder, reporter: Reporter) -> None:
         """All members that are missing; the workers end with the attempt."""
         config = self.config
         transport: Transport = RayTransport(config.cluster) if self.uses_ray else InlineTransport()

@@ -1,13 +1,33 @@
-"""How long work tells what it is doing: the `Reporter` that pipelines speak to, and its three forms."""
+"""Progress of long work: the `Reporter` that pipelines speak to, and its three forms."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
-from typing import Any, Protocol, TextIO
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol, TextIO
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    Progress,
+    Task,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 Figure = float | int | str
+
+SPEED_SECONDS = 600.0
+"""The estimate of the time left takes the mean speed of so many seconds."""
+
+BAR_WIDTH = 10
+FIXED_WIDTH = BAR_WIDTH + 4 + 7 + 7 + 5
+"""Columns of a progress line beside its name and figures: bar, share, time passed, time left, gaps."""
 
 
 class Reporter(Protocol):
@@ -30,16 +50,16 @@ class NullReporter:
     """Says nothing."""
 
     def phase(self, name: str, total: float) -> None:
-        """Nothing."""
+        """Ignore the phase."""
 
     def update(self, done: float, **figures: Figure) -> None:
-        """Nothing."""
+        """Ignore the update."""
 
     def note(self, text: str) -> None:
-        """Nothing."""
+        """Ignore the note."""
 
     def close(self) -> None:
-        """Nothing."""
+        """There is nothing to put away."""
 
 
 class PlainReporter:
@@ -55,96 +75,141 @@ class PlainReporter:
         self, stream: TextIO | None = None, every: float = 5.0, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.stream, self.every, self.clock = stream or sys.stderr, every, clock
-        self._name, self._total, self._began, self._last = "", 0.0, clock(), -float("inf")
-        self._figures: dict[str, Figure] = {}
+        self._phase = PhaseClock("", 0, clock)
+        self._last = -float("inf")
 
     def phase(self, name: str, total: float) -> None:
-        self._name, self._total, self._began, self._last = name, total, self.clock(), -float("inf")
-        self._figures = {}
+        """See `Reporter.phase`."""
+        self._phase, self._last = PhaseClock(name, total, self.clock), -float("inf")
 
     def update(self, done: float, **figures: Figure) -> None:
-        self._figures.update(figures)
+        """See `Reporter.update`."""
+        self._phase.update(done, figures)
         now = self.clock()
-        if now - self._last < self.every and not 0 < self._total <= done:
+        if now - self._last < self.every and not self._phase.task.finished:
             return
         self._last = now
-        parts = [self._name]
-        if self._total:
-            parts.append(f"{100 * min(1.0, done / self._total):.0f}%")
-        parts += [f"{name} {_show(value)}" for name, value in self._figures.items()]
-        parts.append(f"{clock_text(now - self._began)} passed")
-        left = time_left(done, self._total, now - self._began)
-        if left is not None:
-            parts.append(f"about {clock_text(left)} left")
-        self._line("  ".join(parts))
+        self._print_line("  ".join(self._phase.describe()))
 
     def note(self, text: str) -> None:
-        self._line(text)
+        """See `Reporter.note`."""
+        self._print_line(text)
 
     def close(self) -> None:
         """Nothing to put away."""
 
-    def _line(self, text: str) -> None:
+    def _print_line(self, text: str) -> None:
         print(text, file=self.stream, flush=True)
 
 
+class PhaseClock:
+    """One phase: what is done, its figures, and rich's estimate of the time left, without a display.
+
+    The estimate takes the speed between the first update and the last. So a phase that begins at 44 %, as it does
+    after a resume, does not count what was there before it.
+    """
+
+    def __init__(self, name: str, total: float, clock: Callable[[], float]) -> None:
+        progress = Progress(disable=True, get_time=clock, speed_estimate_period=SPEED_SECONDS)
+        self._progress, self._id = progress, progress.add_task(name, total=total or None)
+        self.figures: dict[str, Figure] = {}
+
+    @property
+    def task(self) -> Task:
+        """Rich's record of the phase."""
+        return self._progress.tasks[0]
+
+    def update(self, done: float, figures: Mapping[str, Figure]) -> None:
+        """`done` of the total; `figures` stay until they are given again."""
+        self.figures.update(figures)
+        self._progress.update(self._id, completed=done)
+
+    def describe(self) -> list[str]:
+        """Name, share, figures, time passed and time left, as far as they are known."""
+        task = self.task
+        parts = [task.description]
+        if task.total:
+            parts.append(f"{task.percentage:.0f}%")
+        parts += [figure_text(name, value) for name, value in self.figures.items()]
+        parts.append(f"{clock_text(task.elapsed or 0.0)} passed")
+        if task.total and task.time_remaining is not None:
+            parts.append(f"about {clock_text(task.time_remaining)} left")
+        return parts
+
+
 class RichReporter:
-    """A live bar with phase, figures and time left, for terminals."""
+    """A live bar with phase, figures, time passed and time left, for terminals: rich's own columns.
+
+    Where a line is too long for the terminal, the last figures are left out whole, never cut.
+    """
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
         columns = (
             TextColumn("[bold]{task.description}"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=BAR_WIDTH),
             TaskProgressColumn(),
-            TextColumn("{task.fields[figures]}"),
+            TextColumn("{task.fields[figures]}", markup=False),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
+            TimeRemainingColumn(),
         )
-        self._progress = Progress(*columns, console=Console(file=stream or sys.stderr))
-        self._task: Any = None
-        self._began = time.monotonic()
+        console = Console(file=stream or sys.stderr)
+        self._progress = Progress(*columns, console=console, speed_estimate_period=SPEED_SECONDS)
+        self._task: TaskID | None = None
+        self._room = 0
         self._figures: dict[str, Figure] = {}
         self._progress.start()
 
     def phase(self, name: str, total: float) -> None:
+        """See `Reporter.phase`."""
         if self._task is not None:
-            self._progress.update(self._task, left="")
             self._progress.stop_task(self._task)
-        self._began, self._figures = time.monotonic(), {}
-        self._task = self._progress.add_task(name, total=total or None, figures="", left="")
+        self._figures = {}
+        self._room = self._progress.console.width - len(name) - FIXED_WIDTH
+        self._task = self._progress.add_task(escape(name), total=total or None, figures="")
 
     def update(self, done: float, **figures: Figure) -> None:
+        """See `Reporter.update`."""
         if self._task is None:
             return
         self._figures.update(figures)
-        shown = "  ".join(f"{name} {_show(value)}" for name, value in self._figures.items())
-        left = time_left(done, self._progress.tasks[self._task].total or 0, time.monotonic() - self._began)
-        text = "" if left is None else f"about {clock_text(left)} left"
-        self._progress.update(self._task, completed=done, figures=shown, left=text)
+        texts = [figure_text(name, value) for name, value in self._figures.items()]
+        self._progress.update(self._task, completed=done, figures=fit_texts(texts, self._room))
 
     def note(self, text: str) -> None:
+        """See `Reporter.note`."""
         self._progress.console.print(text, markup=False, highlight=False)
 
     def close(self) -> None:
+        """See `Reporter.close`."""
         self._progress.stop()
 
 
 def make_reporter(quiet: bool = False, stream: TextIO | None = None) -> Reporter:
     """The reporter that suits `stream` (stderr by default): a bar on a terminal, lines elsewhere."""
-    stream = stream or sys.stderr
+    shown = stream or sys.stderr
     if quiet:
         return NullReporter()
-    return RichReporter(stream) if stream.isatty() else PlainReporter(stream)
+    return RichReporter(shown) if shown.isatty() else PlainReporter(shown)
 
 
-def time_left(done: float, total: float, passed: float) -> float | None:
-    """Seconds left at the mean speed so far; None while nothing can be said."""
-    if done <= 0 or total <= 0 or passed <= 0:
-        return None
-    return max(0.0, passed * (total - done) / done)
+def figure_text(name: str, value: Figure) -> str:
+    """A figure of the progress line: its name, then its number."""
+    if isinstance(value, float):
+        text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
+    else:
+        text = f"{value:,}" if isinstance(value, int) else value
+    return f"{name} {text}"
+
+
+def fit_texts(texts: Sequence[str], width: int) -> str:
+    """The first of the texts that fit into `width` side by side, whole."""
+    line = ""
+    for text in texts:
+        longer = f"{line}  {text}" if line else text
+        if len(longer) > width:
+            break
+        line = longer
+    return line
 
 
 def clock_text(seconds: float) -> str:
@@ -155,9 +220,3 @@ def clock_text(seconds: float) -> str:
     minutes, rest = divmod(whole, 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def _show(value: Figure) -> str:
-    if isinstance(value, float):
-        return f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
-    return f"{value:,}" if isinstance(value, int) else value

@@ -1,11 +1,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 
 import pytest
 
-from popgen.progress import NullReporter, PlainReporter, RichReporter, clock_text, make_reporter, time_left
+from popgen.progress import Figure, NullReporter, PlainReporter, RichReporter, clock_text, fit_texts, make_reporter
 
 
 class Terminal(io.StringIO):
@@ -13,45 +12,83 @@ class Terminal(io.StringIO):
         return True
 
 
-def reporter_at(times: list[float]) -> tuple[PlainReporter, io.StringIO]:
-    clock: Iterator[float] = iter(times)
-    stream = io.StringIO()
-    return PlainReporter(stream, every=5.0, clock=lambda: next(clock)), stream
+class Clock:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def run_phase(name: str, total: float, updates: list[tuple[float, float, dict[str, Figure]]]) -> list[str]:
+    """Lines of a plain reporter for updates (time since the phase began, done, figures)."""
+    clock, stream = Clock(), io.StringIO()
+    reporter = PlainReporter(stream, every=5.0, clock=clock)
+    clock.now = 10.0
+    reporter.phase(name, total)
+    for seconds, done, figures in updates:
+        clock.now = 10.0 + seconds
+        reporter.update(done, **figures)
+    reporter.note("done")
+    reporter.close()
+    return stream.getvalue().splitlines()
 
 
 def test_plain_lines_come_every_few_seconds_and_at_the_end() -> None:
-    # made, phase began, then one time per update
-    reporter, stream = reporter_at([0.0, 10.0, 11.0, 12.0, 16.5, 17.0])
-    reporter.phase("member 1", 100)
-    reporter.update(10, steps=1000, dishes=0.5)
-    reporter.update(20, steps=2000)
-    reporter.update(65, steps=6500)
-    reporter.update(100, steps=10_000)
-    reporter.note("done")
-    reporter.close()
-    assert stream.getvalue().splitlines() == [
-        "member 1  10%  steps 1,000  dishes 0.50  1s passed  about 9s left",
+    updates: list[tuple[float, float, dict[str, Figure]]] = [
+        (1, 10, {"steps": 1000, "dishes": 0.5}),
+        (2, 20, {"steps": 2000}),
+        (6.5, 65, {"steps": 6500}),
+        (7, 100, {"steps": 10_000}),
+    ]
+    assert run_phase("member 1", 100, updates) == [
+        "member 1  10%  steps 1,000  dishes 0.50  1s passed",
+        # 55 in 5.5 seconds since the first update: 35 take 3.5, which rich rounds up.
         "member 1  65%  steps 6,500  dishes 0.50  6s passed  about 4s left",
         "member 1  100%  steps 10,000  dishes 0.50  7s passed  about 0s left",
         "done",
     ]
 
 
+def test_what_was_there_before_a_phase_does_not_make_it_fast() -> None:
+    """It begins at 44 % and does 1 % in 2 seconds: after 10 seconds 51 % are left, which take 102."""
+    lines = run_phase("member 2", 100, [(0, 44, {}), (10, 49, {}), (20, 54, {})])
+    assert lines[:3] == [
+        "member 2  44%  0s passed",
+        "member 2  49%  10s passed  about 1:42 left",
+        "member 2  54%  20s passed  about 1:32 left",
+    ]
+
+
 def test_a_phase_of_unknown_length_promises_nothing() -> None:
-    reporter, stream = reporter_at([0.0, 0.0, 8.0])
-    reporter.phase("waiting", 0)
-    reporter.update(3, steps=3)
-    assert stream.getvalue() == "waiting  steps 3  8s passed\n"
+    assert run_phase("waiting", 0, [(8, 3, {"steps": 3})])[0] == "waiting  steps 3  8s passed"
+
+
+def test_figures_that_do_not_fit_are_left_out_whole() -> None:
+    texts = ["steps 1,000", "dishes in training 0.50", "XP 0.10"]
+    assert fit_texts(texts, 80) == "steps 1,000  dishes in training 0.50  XP 0.10"
+    assert fit_texts(texts, 36) == "steps 1,000  dishes in training 0.50"
+    assert fit_texts(texts, 35) == "steps 1,000"
+    assert fit_texts(texts, 3) == ""
+
+
+def test_a_terminal_of_80_columns_shows_numbers_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    terminal = Terminal()
+    reporter = RichReporter(terminal)
+    reporter.phase("member 2 of 8", 100)
+    reporter.update(44, steps=123_456, **{"dishes in training": 2.5})
+    reporter.close()
+    last = [line for line in terminal.getvalue().splitlines() if "44%" in line][-1]
+    assert "steps 123,456" in last and "dishes" not in last.replace("dishes in training 2.50", "")
+    assert "0:00:00" in last and "-:--:--" in last and "44%" in last
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0s"), (59.4, "59s"), (125, "2:05"), (3725, "1:02:05")])
 def test_clock_text(seconds: float, text: str) -> None:
     assert clock_text(seconds) == text
-
-
-def test_time_left() -> None:
-    assert time_left(25, 100, 10) == 30 and time_left(200, 100, 10) == 0
-    assert time_left(0, 100, 10) is None and time_left(1, 0, 10) is None
 
 
 def test_the_stream_decides_the_form() -> None:

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from popgen import durable_files
 from popgen.errors import UserError
 from popgen.jsonable import unique
 
@@ -61,32 +62,9 @@ def to_json(record: BaseModel) -> bytes:
     return (text + "\n").encode()
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _write(path: Path, data: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def replace_file(path: Path, data: bytes) -> None:
     """Write a file so that readers see the old or the new content, never a part."""
-    temporary = path.with_name(f"{TEMPORARY}{path.name}")
-    try:
-        _write(temporary, data)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    durable_files.replace_file(path, data, path.with_name(f"{TEMPORARY}{path.name}"))
 
 
 def publish_folder(final: Path, contents: Mapping[str, bytes]) -> None:
@@ -95,13 +73,13 @@ def publish_folder(final: Path, contents: Mapping[str, bytes]) -> None:
     try:
         temporary.chmod(0o777 & ~_umask())
         for name, data in contents.items():
-            _write(temporary / name, data)
-        sync_folder(temporary)
+            durable_files.write_file(temporary / name, data)
+        durable_files.sync_folder(temporary)
         os.rename(temporary, final)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    sync_folder(final.parent)
+    durable_files.sync_folder(final.parent)
 
 
 def _umask() -> int:

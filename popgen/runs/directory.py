@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from popgen.config.run_config import RunConfig
+from popgen.durable_files import read_regular, replace_file
 from popgen.errors import UserError
-from popgen.runs.state_files import read_regular
 
 LOCK, STATE = "run.lock", "state.json"
 STATES = ("running", "finished", "failed", "interrupted", "damaged")
@@ -117,9 +117,7 @@ class RunState:
             "seconds": round(self._past + (0.0 if state == "running" else now - self.began), 1),
             "error": error,
         }
-        fresh = self.folder / f"{STATE}.writing"
-        fresh.write_text(json.dumps(values), encoding="utf-8")
-        fresh.replace(self.folder / STATE)
+        replace_file(self.folder / STATE, json.dumps(values).encode())
 
 
 def _lock(file: TextIO) -> bool:

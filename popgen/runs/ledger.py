@@ -11,6 +11,7 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+from popgen.durable_files import replace_file
 from popgen.errors import UserError
 from popgen.types import Kind, LedgerEntry
 
@@ -108,12 +109,7 @@ class Ledger:
         if self.path is not None:
             with open(self.path.with_suffix(".lost.jsonl"), "a") as file:
                 file.writelines(_line(entry) for entry in lost)
-            fresh = self.path.with_suffix(".writing")
-            with open(fresh, "w") as file:
-                file.writelines(_line(entry) for entry in entries[:count])
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self.path)
+            replace_file(self.path, "".join(_line(entry) for entry in entries[:count]).encode())
         self._entries.clear()
         self._totals.clear()
         for entry in entries[:count]:

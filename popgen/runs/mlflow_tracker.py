@@ -244,6 +244,58 @@ class Tracker:
         return True
 
 
+class LocalTracker:
+    """A `Tracker` in this process, opened by `start`: for a run without Ray.
+
+    Args:
+        config, run_dir, run_name, params: see `Tracker`.
+    """
+
+    def __init__(self, config: TrackingConfig, run_dir: Path, run_name: str, params: Mapping[str, Any]) -> None:
+        self._arguments = (config, run_dir, run_name, params)
+        self._tracker: Tracker | None = None
+
+    def start(self, resume: Mapping[str, Any] | None = None) -> None:
+        """Open the store.
+
+        Raises:
+            UserError: it cannot be opened.
+        """
+        if self._tracker is None:
+            self._tracker = Tracker(*self._arguments, resume)
+
+    def forget(self) -> None:
+        """There is no other process that could be gone."""
+
+    def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
+        """See `Tracker.log`."""
+        if self._tracker is not None:
+            self._tracker.log(metrics, step, member)
+
+    def log_scaling(self, members: int, environment_steps: int) -> None:
+        """See `Tracker.log_scaling`."""
+        if self._tracker is not None:
+            self._tracker.log_scaling(members, environment_steps)
+
+    def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
+        """See `Tracker.log_artifact`."""
+        if self._tracker is not None:
+            self._tracker.log_artifact(path, folder)
+
+    def flush(self) -> dict[str, Any]:
+        """Write everything; what a later tracker needs to continue in the same MLflow runs."""
+        if self._tracker is None:
+            return {}
+        self._tracker.flush()
+        return self._tracker.state()
+
+    def finish(self, status: str) -> None:
+        """See `Tracker.finish`."""
+        if self._tracker is not None:
+            self._tracker.finish(status)
+            self._tracker = None
+
+
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, Mapping) and value:

@@ -1,176 +1,143 @@
-"""What a run leaves behind: its folder, ledger, metrics, MLflow runs, population and checkpoints."""
+"""What a run leaves behind. The recorder knows the run's folder and fans every record out to its sinks."""
 
 from __future__ import annotations
 
 import json
-import os
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from popgen.actors.tracker_actor import RemoteTracker
 from popgen.config.run_config import RunConfig
+from popgen.durable_files import read_regular, replace_file
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.jsonable import unique
-from popgen.methods.training import Collected
+from popgen.methods.training import Collected, StepCount
 from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.population import PopulationWriter, load_population
 from popgen.population.manifest import MemberInfo
 from popgen.runs.directory import RunState, named, run_folder
 from popgen.runs.ledger import Ledger
-from popgen.runs.monitoring import DiskWatch, RunLog, gauge, show_figures
-from popgen.runs.state_files import read_regular
+from popgen.runs.monitoring import DiskWatch, RunLog
+from popgen.runs.sinks.gauge_sink import GaugeSink
+from popgen.runs.sinks.ledger_sink import LedgerSink
+from popgen.runs.sinks.metrics_sink import MetricsSink
+from popgen.runs.sinks.mlflow_sink import MlflowSink, NoTracker, TrackerClient
+from popgen.runs.sinks.run_log_sink import RunLogSink
+from popgen.runs.sinks.sink import CheckpointWritten, MemberAdded, MetricPoint, Sink
+from popgen.runs.sinks.storage_sink import StorageSink
 from popgen.runs.storage import Mirror
 from popgen.types import Kind, LedgerEntry
 
+TRAINING_KINDS = (Kind.RANDOM, Kind.SP, Kind.XP, Kind.MP)
+
 
 class RunRecorder:
-    """One run's records. Everything is on disk when `close` returns, and enough of it to go on before that.
+    """One run's records. `close` flushes everything; a crash before it loses at most the current iteration.
 
-    Opened again on the same folder, they go on: after the death of a driver, or of an actor, from the disk alone.
+    Opened again on the same folder, a recorder continues from the disk alone.
 
     Args:
         config: of the run; without `run.id` it gets one.
         spec: of its environment.
-        tracker: that of the recorder of an earlier attempt of this process.
+        tracker: writes to MLflow, that of an earlier attempt of this process for one; None for a run without MLflow.
 
     Raises:
         UserError: another process is at this run, it has another config, or a file of it is damaged.
     """
 
-    def __init__(self, config: RunConfig, spec: EnvSpec, tracker: RemoteTracker | None = None) -> None:
+    def __init__(self, config: RunConfig, spec: EnvSpec, tracker: TrackerClient | None = None) -> None:
         config = named(config)
         self.config, self.spec = config, spec
         self.run_id = str(config.run.id)
         self.dir = run_folder(config)
         self.dir.mkdir(parents=True, exist_ok=True)
         self.began = time.time()
+        # The lock comes first: nothing in the folder is touched while another driver is at it.
         self.state = RunState(self.dir)
-        self._check_same_config()
-        self.attempt = self._next_attempt()
-        self._mend_metrics()
+        _check_same_config(self.dir, config)
+        self.attempt = _count_attempt(self.dir)
+        metrics = MetricsSink(self.dir, self.began)
         self.ledger = Ledger(self.dir / "ledger.jsonl")
-        self.population = PopulationWriter(
-            self.dir / "population",
-            spec,
-            method=config.method,
-            config_digest=config.digest(),
-            seed=config.run.seed,
-            resume=True,
-        )
-        params = config.relevant()
-        self.tracker = tracker or RemoteTracker(config.tracking, self.dir, self.run_id, params, self._resumed())
+        self.population = _open_population(self.dir, config, spec)
+        self.tracker = tracker or NoTracker()
+        self.mlflow = MlflowSink(self.dir, self.tracker, self.attempt)
         self.events = RunLog(self.dir, self.run_id, self.attempt)
-        self._next_member()
+        if (member := self._following_member()) is not None:
+            self.events.place = {"member": member}
         self.disk = DiskWatch(self.dir, config.run.disk_reserve)
-        self.mirror = Mirror(self.dir, config.run.storage) if config.run.storage else None
+        self.sinks: tuple[Sink, ...] = (
+            LedgerSink(self.ledger),
+            metrics,
+            self.mlflow,
+            GaugeSink(self.run_id, self.ledger),
+            RunLogSink(self.events),
+        )
+        if config.run.storage:  # last: it copies what the others wrote
+            self.sinks += (StorageSink(Mirror(self.dir, config.run.storage), self.events),)
         self.state.start(self.attempt)
         self.events.write("start", method=config.method, environment=config.env.name)
 
-    def _check_same_config(self) -> None:
-        path = self.dir / "config.json"
-        if path.exists() or path.is_symlink():
-            try:
-                known = RunConfig.parse(json.loads(read_regular(path), object_pairs_hook=unique))
-            except (OSError, ValueError, RecursionError) as error:  # damaged, or of a version with other fields
-                raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
-            if known.digest() != self.config.digest():
-                raise UserError("run.id", f"{self.run_id} exists with another config", "choose another id")
-        _replace(path, json.dumps(self.config.relevant(), indent=1))
-
-    def _next_attempt(self) -> int:
-        path = self.dir / "attempts.txt"
-        attempt = 1 + (read_regular(path).count(b"\n") if path.exists() else 0)
-        with path.open("a") as file:
-            file.write(datetime.now(UTC).isoformat() + "\n")
-        return attempt
-
-    def _resumed(self) -> dict[str, Any] | None:
-        path = self.dir / "tracking.json"
-        try:
-            known = json.loads(read_regular(path)) if path.exists() else {}
-            runs = known.get("runs", {}) if isinstance(known, dict) else None
-            if not isinstance(runs, dict) or not all(isinstance(run, str) for run in runs.values()):
-                raise ValueError("it holds no runs")
-        except (OSError, ValueError, RecursionError) as error:
-            raise UserError(str(path), f"cannot be read ({error})", "remove it: MLflow gets new runs") from None
-        return known if known or self.attempt > 1 else None
-
-    def _mend_metrics(self) -> None:
-        """A process that died while it wrote a point leaves half a line."""
-        path = self.dir / "metrics.jsonl"
-        data = read_regular(path) if path.exists() else b""
-        if data and not data.endswith(b"\n"):
-            os.truncate(path, data.rfind(b"\n") + 1)
+    # ---- environment steps -----------------------------------------------------------------------------------------
 
     def record_sampling(self, member: int, collected: Collected) -> None:
         """Enter a round of sampling: one ledger entry per segment."""
         matches = Counter((e.kind, e.members) for e in collected.episodes)
-        scores: Counter[tuple[Kind, tuple[int, int]]] = Counter()
+        scores: defaultdict[tuple[Kind, tuple[int, int]], float] = defaultdict(float)
         for episode in collected.episodes:
             scores[episode.kind, episode.members] += episode.score
+        entries = []
         for kind, members, sequence, steps in collected.counts:
-            key = (kind, members)
-            entry = LedgerEntry(
-                self.run_id, member, kind, collected.sampler, sequence, steps, matches[key], float(scores[key])
-            )
-            self.ledger.record(entry)
-        self._flush_ledger()
+            episodes, score = matches[kind, members], float(scores[kind, members])
+            entries.append(LedgerEntry(self.run_id, member, kind, collected.sampler, sequence, steps, episodes, score))
+        self._record_entries(entries)
 
-    def record_steps(
-        self, member: int, kind: Kind, name: str, sequence: int, steps: int, episodes: int, score: float = 0.0
-    ) -> None:
+    def record_step_count(self, count: StepCount) -> None:
         """Enter steps that no sampler actor took."""
-        self.ledger.record(LedgerEntry(self.run_id, member, kind, name, sequence, steps, episodes, score))
-        self._flush_ledger()
+        entry = LedgerEntry(
+            self.run_id,
+            count.member,
+            count.kind,
+            count.sampler,
+            count.sequence,
+            count.steps,
+            count.episodes,
+            count.score,
+        )
+        self._record_entries([entry])
+
+    def record_steps(self, member: int, kind: Kind, name: str, sequence: int, steps: int, episodes: int) -> None:
+        """Enter steps that no sampler actor took."""
+        self.record_step_count(StepCount(member, kind, name, sequence, steps, episodes))
 
     def record_evaluation(self, member: int, steps: int, episodes: int) -> None:
         """Enter the final evaluation, a run's last steps. Done again, it counts once: other figures replace the old."""
         name = "evaluation"
-        entries = list(self.ledger)
-        before = next((i for i, e in enumerate(entries) if e.kind is Kind.EVALUATION and e.sampler == name), None)
+        entries = enumerate(self.ledger)
+        before = next((i for i, e in entries if e.kind is Kind.EVALUATION and e.sampler == name), None)
         if before is not None:
             self.ledger.cut(before)
         self.record_steps(member, Kind.EVALUATION, name, 0, steps, episodes)
 
-    def _flush_ledger(self) -> None:
-        self.ledger.flush()
-        for kind in Kind:
-            if steps := self.ledger.steps(kind=kind):
-                gauge("popgen_environment_steps", steps, run=self.run_id, kind=str(kind))
-
-    def progress(self) -> tuple[int, int]:
-        """Members and ledger entries: a run that goes on comes to have more of them than it ever had."""
-        return len(self.population), len(self.ledger)
-
-    def record_checkpoint(self, member: int, iteration: int) -> None:
-        """Tell that a checkpoint is whole on disk, after `iteration` iterations of `member`: it is copied to the
-        storage. A storage that does not take it is told of and does not stop the run."""
-        gauge("popgen_iteration", iteration, run=self.run_id, member=str(member))
-        self.events.place = {"member": member, "iteration": iteration}
-        self.events.write("checkpoint", steps=self.ledger.steps(member=member))
-        self._copy()
-
-    def _copy(self) -> None:
-        if self.mirror is None:
-            return
-        try:
-            self.mirror.push()
-        except OSError as error:
-            text = f"{self.mirror.uri} did not take a copy ({' '.join(str(error).split())[:200]})"
-            self.events.write("note", level="WARNING", text=text)
+    def _record_entries(self, entries: Sequence[LedgerEntry]) -> None:
+        for sink in self.sinks:
+            sink.on_entries(entries)
 
     def training_steps(self, member: int) -> dict[str, int]:
         """This member's environment steps by kind, evaluation aside."""
-        kinds = (Kind.RANDOM, Kind.SP, Kind.XP, Kind.MP)
-        return {str(kind): steps for kind in kinds if (steps := self.ledger.steps(member=member, kind=kind))}
+        return {str(kind): steps for kind in TRAINING_KINDS if (steps := self.ledger.steps(member=member, kind=kind))}
+
+    def member_steps(self) -> list[int]:
+        """Environment steps that each member's training took, those of another run included."""
+        return [info.total_steps for info in load_population(self.population.path).members]
+
+    def progress(self) -> tuple[int, int]:
+        """Members and ledger entries: a run that makes progress comes to have more of them than it ever had."""
+        return len(self.population), len(self.ledger)
 
     def rewind_ledger(self, entries: int, tell: Callable[[str], None]) -> None:
         """Work that no checkpoint holds will be done again: its steps leave the ledger, of which `entries` stay.
@@ -184,35 +151,50 @@ class RunRecorder:
         if lost := self.ledger.cut(entries):
             tell(f"{lost} ledger entries without a checkpoint are set aside: their work is done again")
 
+    # ---- what happens ----------------------------------------------------------------------------------------------
+
     def record_metrics(self, member: int, step: int, **figures: float) -> None:
-        """One point of all given metrics, in metrics.jsonl and MLflow."""
-        if (free := self.disk.look()) is not None:
-            gauge("popgen_disk_free_bytes", free, run=self.run_id)
-        show_figures(self.run_id, member, figures)
-        row = {"member": member, "step": step, "seconds": round(time.time() - self.began, 2)}
-        with (self.dir / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(row | {k: _rounded(v) for k, v in figures.items()}) + "\n")
-        self.tracker.log(figures, step=step, member=member)
+        """One point of all given metrics.
+
+        Raises:
+            UserError: the disk is nearly full.
+        """
+        point = MetricPoint(member, step, figures, self.disk.look())
+        for sink in self.sinks:
+            sink.on_metrics(point)
+
+    def record_checkpoint(self, member: int, iteration: int) -> None:
+        """A checkpoint is whole on disk, after `iteration` iterations of `member`."""
+        checkpoint = CheckpointWritten(member, iteration, self.ledger.steps(member=member))
+        for sink in self.sinks:
+            sink.on_checkpoint(checkpoint)
 
     def add_member(self, policy: Policy, training: Weights | None, *, seed: int, extra: dict[str, Any]) -> None:
-        """Save the next member, with its steps so far, and enter it in the scaling figure."""
-        member = len(self.population) + 1
-        self.population.add_member(policy, seed=seed, steps=self.training_steps(member), training=training, extra=extra)
-        self.tracker.log_scaling(member, sum(self.member_steps()))
-        self.save_tracking()
-        gauge("popgen_members", member, run=self.run_id)
-        self.events.write("member", member=member, steps=sum(self.training_steps(member).values()))
-        self._next_member()
-        self._copy()
+        """Save the next member with its steps so far."""
+        member, steps = len(self.population) + 1, self.training_steps(len(self.population) + 1)
+        self.population.add_member(policy, seed=seed, steps=steps, training=training, extra=extra)
+        added = MemberAdded(member, sum(steps.values()), sum(self.member_steps()), self._following_member())
+        for sink in self.sinks:
+            sink.on_member(added)
 
-    def _next_member(self) -> None:
-        """Lines of the log are from now on of the member that the population does not hold yet."""
-        member = len(self.population) + 1
-        self.events.place = {"member": member} if member <= self.config.population.size else {}
+    def adopt_member(self, policy: Policy, info: MemberInfo, training: Weights | None) -> None:
+        """Copy a member of another run; its steps stay in that run's ledger and in the member's record."""
+        self.population.add_member(policy, seed=info.seed, steps=info.steps, training=training, extra=info.extra)
 
-    def member_steps(self) -> list[int]:
-        """Environment steps that each member's training took, those of another run included."""
-        return [info.total_steps for info in load_population(self.population.path).members]
+    def _following_member(self) -> int | None:
+        """The member that the population does not hold yet, None once it is complete."""
+        member = len(self.population) + 1
+        return member if member <= self.config.population.size else None
+
+    # ---- MLflow ----------------------------------------------------------------------------------------------------
+
+    def start_tracking(self) -> None:
+        """Open the MLflow store; needs Ray where the tracker is an actor."""
+        self.mlflow.start()
+
+    def save_tracking(self) -> None:
+        """Keep the MLflow run ids: a resumed run continues in the same MLflow runs."""
+        self.mlflow.save_runs()
 
     def log_artefacts(self, report: Iterable[Path]) -> None:
         """Copy what the run leaves behind to its MLflow run: configuration, ledger, population and report.
@@ -226,44 +208,58 @@ class RunRecorder:
         for path in report:
             self.tracker.log_artifact(path, "report")
 
-    def save_tracking(self) -> None:
-        """Keep the MLflow run ids: a resumed run goes on in the same MLflow runs."""
-        _replace(self.dir / "tracking.json", json.dumps(self.tracker.flush()))
-
-    def adopt_member(self, policy: Policy, info: MemberInfo, training: Weights | None) -> None:
-        """Copy a member of another run; its steps stay in that run's ledger and in the member's record."""
-        self.population.add_member(policy, seed=info.seed, steps=info.steps, training=training, extra=info.extra)
+    # ---- the end ---------------------------------------------------------------------------------------------------
 
     def close(self, status: str, error: BaseException | None = None) -> None:
         """Everything to disk; status is MLflow's FINISHED, FAILED or KILLED, `error` what ended the run."""
         try:
-            self.ledger.flush()
-            self.tracker.finish(status)
-            if status == "FINISHED":
-                self._copy()
+            for sink in self.sinks:
+                sink.on_end(status)
         finally:
-            self._tell_end(status, error)
+            self._log_end(status, error)
             self.state.end(status, error)
 
     def hand_over(self, error: BaseException) -> None:
-        """An actor or a node died: this attempt ends, other recorder of this process go on with its tracker."""
+        """An actor or a node died: this attempt ends, another recorder of this process continues with its tracker."""
         try:
             self.ledger.flush()
         finally:
-            self._tell_end("KILLED", error)
+            self._log_end("KILLED", error)
             self.state.release()
 
-    def _tell_end(self, status: str, error: BaseException | None) -> None:
+    def _log_end(self, status: str, error: BaseException | None) -> None:
         text = None if error is None else " ".join(str(error).split())[:500]
         self.events.write("end", level="INFO" if error is None else "ERROR", status=status, error=text)
 
 
-def _replace(path: Path, text: str) -> None:
-    """The old contents or the new, whatever interrupts it."""
-    fresh = path.with_name(path.name + ".writing")
-    fresh.write_text(text)
-    fresh.replace(path)
+def _check_same_config(folder: Path, config: RunConfig) -> None:
+    """Keep the config beside the run; a run that exists has the same.
+
+    Raises:
+        UserError: it has another, or one that cannot be read.
+    """
+    path = folder / "config.json"
+    if path.exists() or path.is_symlink():
+        try:
+            previous = RunConfig.parse(json.loads(read_regular(path), object_pairs_hook=unique))
+        except (OSError, ValueError, RecursionError) as error:  # damaged, or of a version with other fields
+            raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
+        if previous.digest() != config.digest():
+            raise UserError("run.id", f"{folder.name} exists with another config", "choose another id")
+    replace_file(path, json.dumps(config.relevant(), indent=1).encode())
 
 
-def _rounded(value: float) -> float | None:
-    return round(float(value), 5) if np.isfinite(value) else None
+def _count_attempt(folder: Path) -> int:
+    """Note that an attempt begins; its number."""
+    path = folder / "attempts.txt"
+    attempt = 1 + (read_regular(path).count(b"\n") if path.exists() else 0)
+    with path.open("a") as file:
+        file.write(datetime.now(UTC).isoformat() + "\n")
+    return attempt
+
+
+def _open_population(folder: Path, config: RunConfig, spec: EnvSpec) -> PopulationWriter:
+    digest, seed = config.digest(), config.run.seed
+    return PopulationWriter(
+        folder / "population", spec, method=config.method, config_digest=digest, seed=seed, resume=True
+    )

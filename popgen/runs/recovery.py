@@ -1,4 +1,4 @@
-"""Going on by itself: which errors mean that a process or machine died, and how often a run starts again."""
+"""Recovery: which errors mean that a process or machine died, and how often a run starts again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.runs.resources import check_room, demands
 
-DEATHS = (
+ACTOR_FAILURES = (
     exceptions.RayActorError,  # an actor died, or its node cannot be reached
     exceptions.WorkerCrashedError,
     exceptions.NodeDiedError,
@@ -33,30 +33,34 @@ FULL = {
 }
 
 
-def chain(error: BaseException) -> Iterator[BaseException]:
+def iterate_causes(error: BaseException) -> Iterator[BaseException]:
     """The error and what caused it: an actor's error comes wrapped, at times more than once."""
-    seen: set[int] = set()
+    visited: set[int] = set()
     following: list[BaseException] = [error]
     while following:
         one = following.pop(0)
-        if id(one) in seen:
+        if id(one) in visited:
             continue
-        seen.add(id(one))
+        visited.add(id(one))
         yield one
         causes = (getattr(one, "cause", None), one.__cause__)
         following += [cause for cause in causes if isinstance(cause, BaseException)]
 
 
-def death(error: BaseException) -> BaseException | None:
+def actor_failure(error: BaseException) -> BaseException | None:
     """What died, if that is why `error` was raised; None for an error of the work itself."""
-    found = [one for one in chain(error) if isinstance(one, DEATHS) and not getattr(one, "_actor_init_failed", False)]
-    plain = [one for one in found if not isinstance(one, exceptions.RayTaskError)]
-    return next(iter(plain or found), None)
+    failures = [
+        one
+        for one in iterate_causes(error)
+        if isinstance(one, ACTOR_FAILURES) and not getattr(one, "_actor_init_failed", False)
+    ]
+    plain = [one for one in failures if not isinstance(one, exceptions.RayTaskError)]
+    return next(iter(plain or failures), None)
 
 
-def told(error: BaseException) -> BaseException:
+def user_facing_error(error: BaseException) -> BaseException:
     """The error for a user: what an actor raised for one, and what is Ray's way to say that a limit is reached."""
-    for one in chain(error):
+    for one in iterate_causes(error):
         if type(one) is UserError:
             return one
         for kind, (field, problem, fix) in FULL.items():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from popgen.durable_files import write_file
 from popgen.errors import UserError
 from popgen.types import Kind, Segment
 
@@ -29,10 +29,7 @@ def save_segments(path: Path, segments: list[Segment], owner: int) -> None:
     marks = [[str(s.kind), list(s.members), s.sampler, s.sequence] for s in segments]
     said = {"owner": str(owner), "segments": json.dumps(marks)}
     data = save(arrays, metadata={**said, "sha256": _digest(arrays, said)})
-    with open(path, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    write_file(path, data)
 
 
 def load_segments(path: Path) -> tuple[list[Segment], int]:

@@ -5,10 +5,8 @@ values.json holds the digests of both parts, so that a damaged bit is noticed an
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from popgen.durable_files import read_regular, sync_folder, write_file
 from popgen.errors import UserError
 
 ARRAYS, VALUES = "arrays.safetensors", "values.json"
@@ -41,10 +40,8 @@ def save_state(folder: str | Path, state: dict[str, Any]) -> None:
         digests = {"arrays": _sha256(data), "values": _sha256(_text(values))}
         document = {"format": FORMAT, "sha256": digests, "values": values}
         for name, content in ((ARRAYS, data), (VALUES, _text(document))):
-            with open(fresh / name, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            write_file(fresh / name, content)
+        sync_folder(fresh)
     except OSError:
         shutil.rmtree(fresh, ignore_errors=True)
         raise
@@ -53,6 +50,7 @@ def save_state(folder: str | Path, state: dict[str, Any]) -> None:
         shutil.rmtree(old, ignore_errors=True)
         folder.rename(old)
     fresh.rename(folder)
+    sync_folder(folder.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -72,17 +70,6 @@ def load_state(folder: str | Path) -> dict[str, Any]:
         return state
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
         raise UserError(str(folder), f"unreadable checkpoint ({error})", "remove it or start a new run") from None
-
-
-def read_regular(path: Path) -> bytes:
-    """Contents of a file; a device or a pipe in its place may have no end.
-
-    Raises:
-        OSError: it cannot be read, or is no regular file.
-    """
-    if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "is no regular file", str(path))
-    return path.read_bytes()
 
 
 def _checked(document: Any, data: bytes) -> Any:

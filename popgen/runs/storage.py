@@ -20,8 +20,8 @@ from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from popgen.durable_files import read_regular, replace_file, write_file
 from popgen.errors import UserError
-from popgen.runs.state_files import read_regular
 
 LATEST, OBJECTS, MARK = "latest.json", "objects", "storage.json"
 FORMAT = 1
@@ -110,9 +110,7 @@ class Mirror:
 
     def _mark(self, folder: Path, writer: str) -> None:
         """Note in the folder whose copy it is up to."""
-        mark = folder / MARK
-        mark.with_suffix(".writing").write_text(json.dumps({"writer": writer}))
-        mark.with_suffix(".writing").replace(mark)
+        replace_file(folder / MARK, json.dumps({"writer": writer}).encode())
 
     def _send(self, path: Path, name: str) -> list[Any]:
         """Upload a file if its contents are not there yet; its digest and size."""
@@ -211,7 +209,7 @@ class Mirror:
             raise UserError("run.storage", f"{name} in {self.uri} is damaged", "choose another id")
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        write_file(path, data)
 
 
 def _check_names(name: str, digest: str) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from popgen import durable_files
 from popgen.envs import EnvSpec, make_env
 from popgen.errors import UserError
 from popgen.play.rollout import play
@@ -188,7 +189,7 @@ def fail_at(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int, BaseExce
 
             return call
 
-        monkeypatch.setattr(files, "_write", faulty(files._write))
+        monkeypatch.setattr(durable_files, "write_file", faulty(durable_files.write_file))
         for name in ("fsync", "rename", "replace"):
             monkeypatch.setattr(os, name, faulty(getattr(os, name)))
         if isinstance(error, Killed):

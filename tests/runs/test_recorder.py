@@ -14,7 +14,7 @@ from popgen.config.sections import RunSection, TrackingConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.policies.simple_policies import RandomPolicy
-from popgen.reports.run_figures import training_curves
+from popgen.reports.training_curves import Point, read_curves
 from popgen.runs.mlflow_tracker import Tracker
 from popgen.runs.recorder import RunRecorder
 from popgen.types import Kind
@@ -73,10 +73,9 @@ def test_half_a_point_is_dropped_and_repeated_points_count_once(tmp_path: Path) 
         second.record_metrics(1, step, real_sp=score)
     second.record_metrics(2, 50, real_sp=7.0, real_xp_max=0.5)
     assert all(json.loads(line) for line in path.read_text().splitlines())
-    assert training_curves(path) == {
-        "member 1, SP": ([100, 200, 350], [1.0, 2.5, 4.0]),
-        "member 2, SP": ([50], [7.0]),
-        "member 2, strongest XP": ([50], [0.5]),
+    assert read_curves(path) == {
+        1: (Point(100, 1.0, None), Point(200, 2.5, None), Point(350, 4.0, None)),
+        2: (Point(50, 7.0, 0.5),),
     }
 
 

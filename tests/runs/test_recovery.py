@@ -13,8 +13,8 @@ from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.pipelines import population as main_job
-from popgen.runs import recovery as survival
-from popgen.runs.recovery import RetryBudget, death, told, wait_for_room
+from popgen.runs import recovery
+from popgen.runs.recovery import RetryBudget, actor_failure, user_facing_error, wait_for_room
 
 
 def wrapped(cause: Exception) -> exceptions.RayTaskError:
@@ -41,14 +41,14 @@ def actor_died() -> exceptions.ActorDiedError:
     ids=lambda error: type(error).__name__,
 )
 def test_a_death_is_known_however_it_is_wrapped(error: Exception) -> None:
-    cause = death(error)
-    assert isinstance(cause, survival.DEATHS) and not isinstance(cause, exceptions.RayTaskError)
+    cause = actor_failure(error)
+    assert isinstance(cause, recovery.ACTOR_FAILURES) and not isinstance(cause, exceptions.RayTaskError)
 
 
 def test_the_dead_are_named() -> None:
     text = "The actor died unexpectedly.\n\tclass_name: ModelActor\n\tactor_id: 1"
-    assert survival.first_line(exceptions.WorkerCrashedError()).startswith("WorkerCrashedError: ")
-    said = survival.first_line(wrapped(exceptions.NodeDiedError(text)).cause)
+    assert recovery.first_line(exceptions.WorkerCrashedError()).startswith("WorkerCrashedError: ")
+    said = recovery.first_line(wrapped(exceptions.NodeDiedError(text)).cause)
     assert said == "NodeDiedError (ModelActor): The actor died unexpectedly."
 
 
@@ -56,22 +56,22 @@ def test_the_dead_are_named() -> None:
     "error", [ValueError("x"), wrapped(FloatingPointError("nan")), UserError("a", "b"), wrapped(OSError(28, "full"))]
 )
 def test_errors_of_the_work_itself_are_no_deaths(error: Exception) -> None:
-    assert death(error) is None
+    assert actor_failure(error) is None
 
 
 def test_an_actor_that_could_not_be_made_is_not_made_again() -> None:
     error = actor_died()
     error._actor_init_failed = True
-    assert death(error) is None
+    assert actor_failure(error) is None
 
 
 def test_users_errors_and_limits_come_out_of_an_actor_as_one_line() -> None:
     inner = UserError("tracking.uri", "cannot open it", "choose another")
-    assert told(wrapped(inner)) is inner
-    full = told(wrapped(exceptions.ObjectStoreFullError("full")))
+    assert user_facing_error(wrapped(inner)) is inner
+    full = user_facing_error(wrapped(exceptions.ObjectStoreFullError("full")))
     assert isinstance(full, UserError) and full.field == "cluster.object_store_bytes"
     other = ValueError("x")
-    assert told(other) is other
+    assert user_facing_error(other) is other
 
 
 def test_patience_ends_with_deaths_in_a_row_at_the_same_place() -> None:
@@ -94,7 +94,7 @@ def test_nodes_are_waited_for_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) 
         return [dead, {"Alive": True, "Resources": have.pop(0) if len(have) > 1 else have[0]}]
 
     monkeypatch.setattr("ray.nodes", nodes)
-    monkeypatch.setattr(survival.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
+    monkeypatch.setattr(recovery.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
     wait_for_room(config, said.append, clock=lambda: now[-1])
     assert said == ["waiting for nodes: the actors ask for 1.9 CPU, the cluster has 1"] and len(now) == 3
     have[:] = [{"CPU": 1.0}]
@@ -108,14 +108,10 @@ def run_with(monkeypatch: pytest.MonkeyPatch, root: Path, attempts: list[Callabl
     from popgen.pipelines.population import run_population
     from popgen.progress import NullReporter
 
-    class Driver:
-        def __init__(self, config: Any, spec: Any, recorder: Any, reporter: Any) -> None:
-            self.recorder = recorder
+    def train(job: Any, recorder: Any, reporter: Any) -> None:
+        attempts.pop(0)(recorder)
 
-        def run(self) -> None:
-            attempts.pop(0)(self.recorder)
-
-    monkeypatch.setattr(main_job, "driver_class", lambda method: Driver)
+    monkeypatch.setattr(main_job.PopulationJob, "train_members", train)
     monkeypatch.setattr(main_job, "start_ray", lambda config: False)
     monkeypatch.setattr(main_job, "wait_for_room", lambda config, tell: None)
     monkeypatch.setattr(main_job, "finish", lambda config, spec, recorder, reporter: {"run_dir": str(recorder.dir)})

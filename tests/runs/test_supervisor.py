@@ -145,7 +145,8 @@ def test_a_command_stops_and_goes_on_with_its_driver(tmp_path: Path) -> None:
 
 def test_the_command_line_is_guarded(tmp_path: Path) -> None:
     """Not in this process: `main` with arguments of its own never is."""
-    code = "import sys; from popgen.cli import main, guard; guard.guarded = lambda *given: print(*given) or 7; main()"
+    setup = "import sys; from popgen.cli import main; from popgen.runs import supervisor; "
+    code = setup + "supervisor.guarded = lambda *args: print(*args) or 7; main()"
     command = [sys.executable, "-c", code, "run", "scale=smoke", "run.root=runs", "run.id=r", "cluster.retries=3"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.stdout == "runs/r 3\n", done.stderr
