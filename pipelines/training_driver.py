@@ -95,9 +95,7 @@ class TrainingDriver:
                 self.checkpoints.append(sampled.segments, record.member)
             self.recorder.record_sampling(record.member, sampled.collected)
         for count in record.counted:
-            self.recorder.record_steps(
-                count.member, count.kind, count.sampler, count.sequence, count.steps, count.episodes, count.score
-            )
+            self.recorder.record_step_count(count)
 
     def _record_figures(self, record: Progress) -> None:
         """A point of metrics.

@@ -79,7 +79,7 @@ def launch(root: Path, name: str, *overrides: str, die_at: str = "") -> Path:
         return dying
 
     spec = build_env(config.env, 1).spec
-    kind = mortal(mortal(mortal(RunRecorder, "record_sampling"), "record_steps"), "add_member")
+    kind = mortal(mortal(mortal(RunRecorder, "record_sampling"), "record_step_count"), "add_member")
     recorder = kind(config, spec)
     training = open_training(config, spec, f"{recorder.run_id}.{recorder.attempt}", InlineTransport())
     files = mortal(CheckpointFiles, "save")(recorder.dir, long=training.log_rows, seconds=0.0)
@@ -156,7 +156,7 @@ def test_another_seed_gives_another_population(whole: Path, root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "die_at", ["record_sampling:3", "record_steps:2", "record_steps:5", "save:2", "save:4", "add_member:2"]
+    "die_at", ["record_sampling:3", "record_step_count:2", "record_step_count:5", "save:2", "save:4", "add_member:2"]
 )
 def test_interrupted_anywhere_the_run_ends_the_same(whole: Path, root: Path, die_at: str) -> None:
     name = die_at.replace(":", "-")
@@ -180,6 +180,15 @@ def test_async_overlaps_and_counts_the_same_steps(whole: Path, root: Path) -> No
     recorder, other = Ledger(overlapped / "ledger.jsonl"), Ledger(whole / "ledger.jsonl")
     for kind in (Kind.SP, Kind.XP, Kind.SIMULATED):
         assert recorder.steps(2, kind) == other.steps(2, kind)
+
+
+def test_overlapping_and_interrupted_it_ends_the_same(root: Path) -> None:
+    overrides = ("run.schedule=async", "population.size=2")
+    never = launch(root, "never", *overrides)
+    with pytest.raises(Killed):
+        launch(root, "once", *overrides, die_at="record_step_count:5")
+    assert weights(launch(root, "once", *overrides)) == weights(never)
+    assert ledger(root / "once") == ledger(never)
 
 
 def test_rendezvous_and_no_cross_play_pressure(root: Path) -> None:
