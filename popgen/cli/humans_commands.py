@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import Parser, add_command, at_least
@@ -53,7 +54,7 @@ def fit_humans(args: argparse.Namespace) -> int:
     layouts, halves = args.layout or list(LAYOUTS), args.half or list(HALVES)
     for layout in layouts:
         make_human_env(layout)
-    check_root(args.out, 2**24, "--out")
+    check_root(Path(args.out), 2**24, "--out")
     began, written = time.perf_counter(), []
     games = load_games([HALVES[half] for half in halves], layouts)
     with closing(make_reporter(quiet=args.quiet)) as reporter:
@@ -68,7 +69,10 @@ def fit_humans(args: argparse.Namespace) -> int:
             figures |= {"cells": len(MEASURES), "likelihood": proxies[0].likelihood}
             written.append({"layout": layout, "half": half, "path": str(path), **figures})
             if not args.json:
-                print(f"{path}: {figures['dishes']:.2f} dishes, {figures['within']} of {figures['cells']} within 1 SD")
+                print(
+                    f"{path}: {figures['dishes']:.2f} dishes, {figures['within']} of {figures['cells']} within 1 SD",
+                    flush=True,
+                )
     seconds = time.perf_counter() - began
     if args.json:
         print_json({"out": args.out, "seconds": seconds, "populations": written})

@@ -102,8 +102,8 @@ class _TreeReader:
             self._stack.append([])
         elif name == "EMPTY_DICT":
             self._stack.append({})
-        elif name == "APPENDS":
-            items = self._pop_to_mark()
+        elif name in ("APPEND", "APPENDS"):
+            items = self._pop(1) if name == "APPEND" else self._pop_to_mark()
             self._top(list).extend(items)
         elif name in ("SETITEM", "SETITEMS"):
             items = self._pop(2) if name == "SETITEM" else self._pop_to_mark()
@@ -152,7 +152,8 @@ class _TreeReader:
 
 def _accepted(module: Any, name: Any) -> Name:
     if not isinstance(module, str) or not isinstance(name, str) or (module, name) not in GLOBALS:
-        raise FrameError(f"refers to {str(module)[:60]}.{str(name)[:60]}, which no table needs")
+        shown = " ".join(f"{str(module)[:60]}.{str(name)[:60]}".split())
+        raise FrameError(f"refers to {shown}, which no table needs")
     return Name(module, name)
 
 
