@@ -6,7 +6,7 @@ Rules are functions of a progress record and the recipe; nothing runs for them.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +16,9 @@ from popgen.methods.training import Pending, State
 from popgen.methods.xpm_wm.config import Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.start_states import Starts
 from popgen.nets.weights import Weights
+from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerStrength
+from popgen.types import Kind
 
 CONFIRMED = 0.97
 """Share of the target that the last policy must reach by itself."""
@@ -105,8 +107,12 @@ class FirstMemberProgress:
     model: Pending[Weights] | None = None
     starts: Pending[Starts] | None = None
 
-    def add_episodes(self, scores: Iterable[float], shaped: Iterable[float]) -> None:
+    def add_episodes(self, episodes: Sequence[Episode]) -> None:
         """Episodes that have ended; only the last `window` count."""
+        self.add_scores([e.score for e in episodes], [e.shaped for e in episodes])
+
+    def add_scores(self, scores: Iterable[float], shaped: Iterable[float]) -> None:
+        """Scores and shaped returns of episodes."""
         self.recent = deque([*self.recent, *scores], self.window)
         self.shaped = deque([*self.shaped, *shaped], self.window)
 
@@ -145,7 +151,7 @@ class FirstMemberProgress:
             model=put(state["model"]),
             starts=put(Starts(**state["starts"])),
         )
-        progress.add_episodes(map(float, state["recent"]), map(float, state["shaped"]))
+        progress.add_scores(map(float, state["recent"]), map(float, state["shaped"]))
         return progress
 
 
@@ -159,6 +165,7 @@ class LaterMemberProgress:
         rounds: of real episodes that have ended.
         plays: self-play has begun (`agent.entropy_after` of the target).
         best: the policy of the best round.
+        figures: of the last round.
     """
 
     strength: PartnerStrength
@@ -166,6 +173,7 @@ class LaterMemberProgress:
     rounds: int = 0
     plays: bool = False
     best: Candidate | None = None
+    figures: dict[str, float] = field(default_factory=dict)
 
     def to_state(self) -> State:
         """For a checkpoint, after the first round."""
@@ -225,6 +233,13 @@ def is_confirmed(score: float, phase: Phase1Config) -> bool:
     return score >= CONFIRMED * phase.target_score
 
 
+def window_figures(progress: FirstMemberProgress, horizon: int) -> dict[str, float]:
+    """Scores and shaped reward per step of the last episodes; nothing where there are none."""
+    if not progress.recent:
+        return {}
+    return {"real_sp": mean_score(progress), "real_shaped_sp": float(np.mean(progress.shaped)) / horizon}
+
+
 def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after: float) -> None:
     """Remember the policy that played, not the one learned meanwhile; rounds count once there is a full window."""
     if not has_full_window(progress):
@@ -258,3 +273,26 @@ def plays_on(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> b
     """The configured rounds are played in any case, further ones only by a member that is still weak."""
     weak = progress.best is None or progress.best.sp < phase.target_score
     return progress.rounds < (most if weak else min(phase.rounds, most))
+
+
+def judge_round(
+    progress: LaterMemberProgress, published: MemberWeights, episodes: Sequence[Episode], horizon: int
+) -> Candidate:
+    """Line 9's returns from B_XP, of every partner met; the round's policy with its scores, kept if it is the best."""
+    own = [e for e in episodes if e.kind is Kind.SP]
+    partners = sorted({partner for e in episodes if e.kind is Kind.XP for partner in e.members} - set(own[0].members))
+    cross = {k: [e for e in episodes if e.kind is Kind.XP and k in e.members] for k in partners}
+    for partner, met in cross.items():
+        progress.strength.add(partner, [e.shaped for e in met])
+    strongest = max(float(np.mean([e.score for e in met])) for met in cross.values())
+    candidate = Candidate(published, float(np.mean([e.score for e in own])), strongest)
+    if progress.best is None or candidate.merit > progress.best.merit:
+        progress.best = candidate
+    progress.rounds += 1
+    progress.figures = {
+        "real_sp": candidate.sp,
+        "real_xp_max": strongest,
+        "real_shaped_sp": float(np.mean([e.shaped for e in own])) / horizon,
+        "round": progress.rounds,
+    }
+    return candidate

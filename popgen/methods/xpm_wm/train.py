@@ -12,17 +12,23 @@ import numpy as np
 
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
-from popgen.methods.training import Pending, Phase, PolicySnapshot, Progress, Record, Round, Sampled
+from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled
 from popgen.methods.xpm_wm import member_progress as rules
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.overlap import Overlap
+from popgen.methods.xpm_wm.real_matches import (
+    later_matches,
+    policy_snapshot,
+    random_match,
+    random_snapshot,
+    seatings,
+    self_play_match,
+)
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelUpdate, Workers
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
-from popgen.play.matches import Match
-from popgen.policies.simple_policies import RandomPolicy
-from popgen.types import RANDOM_MEMBER, Kind
+from popgen.types import RANDOM_MEMBER
 
 Loop = Generator[Record, bool | None, Candidate]
 
@@ -30,12 +36,6 @@ FIRST = 1
 LEARNERS = ("model", "agent")
 MODEL_PIECE, AGENT_PIECE = 100, 50
 """Updates between two signs of progress."""
-
-
-def policy_snapshot(config: RunConfig, acting: Pending[Weights]) -> PolicySnapshot:
-    """A member's policy as it travels to a sampler."""
-    sizes = {"world_model": config.world_model.model_dump(mode="json"), "agent": config.agent.model_dump(mode="json")}
-    return PolicySnapshot("world_model", sizes, acting)
 
 
 def episodes_of(sampled: Sequence[Sampled]) -> list[Episode]:
@@ -79,17 +79,12 @@ class FirstMember:
         """Lines 2 and 3: B_SP is populated with K random episodes."""
         phase, progress = self.phase, self.progress
         yield Phase("member 1: random play", phase.prefill_steps)
-        names, interact, probabilities = self.spec.action_names, phase.prefill_interact, None
-        if interact and "interact" in names:
-            rest = (1.0 - interact) / (len(names) - 1)
-            probabilities = [interact if name == "interact" else rest for name in names]
-        random = RandomPolicy(self.spec.num_actions, probabilities)
-        snapshot = PolicySnapshot(random.kind, random.config(), self.work.put({}))
-        match = Match(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), phase.envs)
-        self.work.start_episodes([match], {RANDOM_MEMBER: snapshot}, self.seed)
+        snapshot = random_snapshot(self.spec, phase.prefill_interact, self.work.put)
+        self.work.start_episodes([random_match(phase.envs)], {RANDOM_MEMBER: snapshot}, self.seed)
         while progress.steps < phase.prefill_steps:
             missing = (phase.prefill_steps - progress.steps) // phase.envs
-            sampled = self.collect(max(1, min(PREFILL_CHUNK, missing)))
+            sampled = self.work.collect(max(1, min(PREFILL_CHUNK, missing)))
+            self.add_to_buffers(sampled)
             shown = {"steps": progress.steps}
             yield Progress(FIRST, progress.steps, sampled=tuple(sampled), done=progress.steps, shown=shown)
 
@@ -111,7 +106,7 @@ class FirstMember:
         assert self.progress.published is not None
         seed = self.seed + 10_000 * (2 * self.progress.confirmations - (not stagger))
         policies = {FIRST: policy_snapshot(self.config, self.progress.published.acting)}
-        self.work.start_episodes([Match(Kind.SP, (FIRST, FIRST), self.phase.envs)], policies, seed, stagger)
+        self.work.start_episodes([self_play_match(FIRST, self.phase.envs)], policies, seed, stagger)
 
     def play_rounds(self, overlap: Overlap) -> Generator[Record, bool | None, None]:
         """Line 4, with lines 5-7, 8-15 and 17-18 side by side: until the phase should stop, or rests for a checkpoint.
@@ -168,7 +163,7 @@ class FirstMember:
         """Seconds and processor seconds that a finished task took; what it gave is the newest now."""
         progress = self.progress
         if isinstance(result, Sampled):
-            self.add_episodes([result])  # 18
+            progress.add_episodes(self.add_to_buffers([result]))  # 18
             sampled.append(result)
             return 0.0, result.collected.cpu_seconds
         if isinstance(result, ModelUpdate):
@@ -178,27 +173,17 @@ class FirstMember:
         progress.figures |= {f"{kind}/{name}": value for name, value in result.metrics.items()}
         return result.metrics["seconds"], result.metrics["cpu_seconds"]
 
-    def add_episodes(self, sampled: list[Sampled]) -> None:
-        """Line 18: into B_SP, and into the window that the policy is judged by."""
+    def add_to_buffers(self, sampled: list[Sampled]) -> list[Episode]:
+        """Lines 3 and 18: into B_SP; the episodes that ended."""
         self.work.add_to_buffers(sampled, FIRST)
         self.progress.steps += sum(one.collected.steps for one in sampled)
-        episodes = episodes_of(sampled)
-        self.progress.add_episodes([e.score for e in episodes], [e.shaped for e in episodes])
-
-    def collect(self, steps: int) -> list[Sampled]:
-        """All samplers play, into the buffers."""
-        sampled = self.work.collect(steps)
-        self.work.add_to_buffers(sampled, FIRST)
-        self.progress.steps += sum(one.collected.steps for one in sampled)
-        return sampled
+        return episodes_of(sampled)
 
     def end_round(self, overlap: Overlap, sampled: tuple[Sampled, ...]) -> Round:
         """Judge the round; start actor and critics again if that is due."""
         progress = self.progress
         progress.rounds += 1
-        if progress.recent:
-            shaped = float(np.mean(progress.shaped)) / self.spec.horizon
-            progress.figures |= {"real_sp": rules.mean_score(progress), "real_shaped_sp": shaped}
+        progress.figures |= rules.window_figures(progress, self.spec.horizon)
         self.look_at_model()
         progress.figures |= overlap.figures()
         figures = dict(progress.figures)
@@ -244,12 +229,12 @@ class FirstMember:
         progress.confirmations += 1
         self.start_self_play(stagger=False)
         sampled = self.work.collect(self.spec.horizon)
-        self.add_episodes(sampled)
-        scores = [episode.score for episode in episodes_of(sampled)]
-        score = float(np.mean(scores))
+        episodes = self.add_to_buffers(sampled)
+        progress.add_episodes(episodes)
+        score = float(np.mean([episode.score for episode in episodes]))
         progress.confirmed = rules.is_confirmed(score, self.phase)
         outcome = "taken" if progress.confirmed else "learning continues"
-        note = f"member 1: {score:.2f} {self.spec.score_name} in {len(scores)} episodes of one policy: {outcome}"
+        note = f"member 1: {score:.2f} {self.spec.score_name} in {len(episodes)} episodes of one policy: {outcome}"
         yield Progress(FIRST, progress.steps, sampled=tuple(sampled), note=note)
         return progress.confirmed
 
@@ -269,8 +254,7 @@ class LaterMember:
     ) -> None:
         self.work, self.config, self.spec, self.member, self.seed = work, config, spec, member, seed
         self.archive, self.progress, self.phase = archive, progress, config.phase2
-        self.partners = sorted(archive)
-        self.pairs = [pair for partner in self.partners for pair in ((member, partner), (partner, member))]
+        self.pairs = seatings(member, sorted(archive))
         # Every partner's cross-play must be known to tell the strongest, in both seats.
         self.episodes_xp = max(self.phase.episodes_xp, len(self.pairs))
         self.most_rounds = rules.most_rounds(self.phase, self.episodes_xp, spec.horizon)
@@ -322,10 +306,7 @@ class LaterMember:
         """Lines 17, 19 and 20: one episode in each environment; partners act with their own archived filters, and every
         pair is met in an order drawn for the round."""
         seed = self.seed * 100 + self.progress.rounds + 1
-        matches = [Match(Kind.SP, (self.member, self.member), self.phase.episodes_sp)]
-        order = np.random.default_rng(seed).permutation(len(self.pairs))
-        counts = np.bincount(np.arange(self.episodes_xp) % len(self.pairs), minlength=len(self.pairs))
-        matches += [Match(Kind.XP, self.pairs[i], int(n)) for i, n in zip(order, counts, strict=True)]
+        matches = later_matches(self.member, self.pairs, self.phase.episodes_sp, self.episodes_xp, seed)
         acting = {**self.archive, self.member: published.acting}
         policies = {member: policy_snapshot(self.config, weights) for member, weights in acting.items()}
         self.work.start_episodes(matches, policies, seed)
@@ -333,30 +314,14 @@ class LaterMember:
 
     def judge(self, published: MemberWeights, sampled: list[Sampled]) -> Round:
         """What the real episodes say: whether this is the best round, and each partner's cross-play return."""
-        progress, episodes = self.progress, episodes_of(sampled)
+        progress = self.progress
         progress.steps += sum(one.collected.steps for one in sampled)
-        progress.rounds += 1
-        own = [e for e in episodes if e.kind is Kind.SP]
-        cross = {k: [e for e in episodes if e.kind is Kind.XP and k in e.members] for k in self.partners}
-        for partner, met in cross.items():
-            progress.strength.add(partner, [e.shaped for e in met])
-        strongest = max(float(np.mean([e.score for e in met])) for met in cross.values())
-        candidate = Candidate(published, float(np.mean([e.score for e in own])), strongest)
-        progress.plays |= candidate.sp >= self.config.agent.entropy_after * self.phase.target_score
-        if progress.best is None or candidate.merit > progress.best.merit:
-            progress.best = candidate
-        figures = {
-            "real_sp": candidate.sp,
-            "real_xp_max": strongest,
-            "real_shaped_sp": float(np.mean([e.shaped for e in own])) / self.spec.horizon,
-            "round": progress.rounds,
-        }
+        scored = rules.judge_round(progress, published, episodes_of(sampled), self.spec.horizon)
+        progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
         note = (
-            f"member {self.member}, round {progress.rounds}: SP {candidate.sp:.2f}, strongest XP {strongest:.2f} "
+            f"member {self.member}, round {progress.rounds}: SP {scored.sp:.2f}, strongest XP {scored.xp:.2f} "
             f"{self.spec.score_name}, {progress.steps:,} steps"
         )
-        goes_on = rules.plays_on(progress, self.phase, self.most_rounds)
-        sampled_all = tuple(sampled)
-        return Round(
-            self.member, progress.steps, figures, sampled_all, note=note, number=progress.rounds, at_rest=goes_on
-        )
+        number, goes_on = progress.rounds, rules.plays_on(progress, self.phase, self.most_rounds)
+        figures = progress.figures
+        return Round(self.member, progress.steps, figures, tuple(sampled), note=note, number=number, at_rest=goes_on)

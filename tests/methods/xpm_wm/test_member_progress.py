@@ -31,7 +31,7 @@ def member() -> FirstMemberProgress:
 
 
 def play(progress: FirstMemberProgress, phase: Phase1Config, *scores: float) -> None:
-    progress.add_episodes(scores, scores)
+    progress.add_scores(scores, scores)
     rules.keep_best(progress, phase, AFTER)
 
 
@@ -51,9 +51,9 @@ def test_patience_begins_when_there_is_a_window_to_judge_by() -> None:
 
 def test_the_target_needs_a_whole_window_and_the_budget_does_not() -> None:
     first, phase = member(), Phase1Config(target_score=5.0, max_steps=100)
-    first.add_episodes([8.0] * 15, [])
+    first.add_scores([8.0] * 15, [])
     assert not rules.should_stop(first, phase)
-    first.add_episodes([8.0], [])
+    first.add_scores([8.0], [])
     assert rules.should_stop(first, phase) and rules.reached_target(first, phase)
     first = member()
     first.steps = 100
@@ -95,7 +95,7 @@ def test_the_last_policy_must_reach_the_target_by_itself() -> None:
     assert not rules.is_confirmed(9.69, phase) and rules.is_confirmed(9.7, phase)
     first = member()
     play(first, phase, *[20.0] * 16)
-    first.add_episodes([9.7] * 16, [])
+    first.add_scores([9.7] * 16, [])
     assert rules.choose_first(first).weights is PLAYED
     first.confirmed = True
     assert rules.choose_first(first) == Candidate(LATEST, pytest.approx(9.7), 0.0)

@@ -1,0 +1,57 @@
+"""Who plays in the real environments: matches of both phases, and policies as they travel to samplers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
+from popgen.methods.training import Pending, PolicySnapshot
+from popgen.nets.weights import Weights
+from popgen.play.matches import Match
+from popgen.policies.simple_policies import RandomPolicy
+from popgen.types import RANDOM_MEMBER, Kind
+
+Pair = tuple[int, int]
+
+
+def policy_snapshot(config: RunConfig, acting: Pending[Weights]) -> PolicySnapshot:
+    """A member's policy as it travels to a sampler."""
+    sizes = {"world_model": config.world_model.model_dump(mode="json"), "agent": config.agent.model_dump(mode="json")}
+    return PolicySnapshot("world_model", sizes, acting)
+
+
+def random_snapshot(spec: EnvSpec, interact: float, put: Callable[[Any], Pending[Any]]) -> PolicySnapshot:
+    """The random player; where there is such an action, it interacts with probability `interact` (0: as any other)."""
+    names, probabilities = spec.action_names, None
+    if interact and "interact" in names:
+        rest = (1.0 - interact) / (len(names) - 1)
+        probabilities = [interact if name == "interact" else rest for name in names]
+    random = RandomPolicy(spec.num_actions, probabilities)
+    return PolicySnapshot(random.kind, random.config(), put({}))
+
+
+def random_match(envs: int) -> Match:
+    """Random play in all environments."""
+    return Match(Kind.RANDOM, (RANDOM_MEMBER, RANDOM_MEMBER), envs)
+
+
+def self_play_match(member: int, envs: int) -> Match:
+    """Self-play in all environments."""
+    return Match(Kind.SP, (member, member), envs)
+
+
+def seatings(member: int, partners: Sequence[int]) -> list[Pair]:
+    """Every partner, in both seats."""
+    return [pair for partner in partners for pair in ((member, partner), (partner, member))]
+
+
+def later_matches(member: int, pairs: Sequence[Pair], episodes_sp: int, episodes_xp: int, seed: int) -> list[Match]:
+    """Self-play, and cross-play of every pair, in an order drawn by `seed`: an episode in each environment."""
+    order = np.random.default_rng(seed).permutation(len(pairs))
+    counts = np.bincount(np.arange(episodes_xp) % len(pairs), minlength=len(pairs))
+    cross = [Match(Kind.XP, pairs[i], int(n)) for i, n in zip(order, counts, strict=True)]
+    return [self_play_match(member, episodes_sp), *cross]
