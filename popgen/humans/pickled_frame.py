@@ -167,7 +167,7 @@ def read_columns(data: bytes) -> dict[str, np.ndarray]:
         return _to_columns(_TreeReader().read(data))
     except FrameError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, struct.error) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, struct.error) as error:
         raise FrameError(f"is damaged ({' '.join(str(error).split())[:120] or type(error).__name__})") from None
     except (RecursionError, MemoryError) as error:
         raise FrameError(f"is damaged ({type(error).__name__})") from None
