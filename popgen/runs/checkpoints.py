@@ -106,10 +106,10 @@ class Checkpoints:
             UserError: all are damaged.
         """
         damage: UserError | None = None
-        for number in reversed(self._numbers()):
+        for number in reversed(self._list_numbers()):
             try:
-                state = load_state(self._progress(number))
-                log = _log_of(self._progress(number), state)
+                state = load_state(self._progress_folder(number))
+                log = _log_of(self._progress_folder(number), state)
             except UserError as error:
                 damage = damage or error
                 continue
@@ -140,7 +140,7 @@ class Checkpoints:
 
     def keep(self, segments: list[Segment], owner: int) -> None:
         """Add to the log."""
-        save_segments(self._segments(self.count), segments, owner)
+        save_segments(self._segments_path(self.count), segments, owner)
         self.count += 1
         self.rows += sum(segment.steps for segment in segments)
 
@@ -155,18 +155,18 @@ class Checkpoints:
             save_state(self.folder / name, replays())
             self.base, self.first, self.rows = name, self.count, 0
         log = {"base": self.base, "first": self.first, "count": self.count, "rows": self.rows}
-        number = max((0, *self._numbers())) + 1
-        save_state(self._progress(number), {**state, "member": member, "log": log})
+        number = max((0, *self._list_numbers())) + 1
+        save_state(self._progress_folder(number), {**state, "member": member, "log": log})
         self.needed[number] = log
-        self._tidy()
+        self._remove_unneeded()
         self.last = time.monotonic()
 
-    def _tidy(self) -> None:
+    def _remove_unneeded(self) -> None:
         """Remove what none of the kept checkpoints needs."""
         self.needed = {number: self.needed[number] for number in sorted(self.needed)[-KEPT:]}
-        for number in self._numbers():
+        for number in self._list_numbers():
             if number not in self.needed:
-                shutil.rmtree(self._progress(number), ignore_errors=True)
+                shutil.rmtree(self._progress_folder(number), ignore_errors=True)
         bases, first = {log["base"] for log in self.needed.values()}, min(log["first"] for log in self.needed.values())
         for path in self.folder.glob("base_*"):
             if path.name not in bases:
@@ -182,20 +182,20 @@ class Checkpoints:
     def log(self) -> Iterator[tuple[list[Segment], int]]:
         """Segments (with owner) to add to that, in order."""
         for number in range(self.first, self.count):
-            yield load_segments(self._segments(number))
+            yield load_segments(self._segments_path(number))
 
-    def _numbers(self) -> list[int]:
+    def _list_numbers(self) -> list[int]:
         """Of the checkpoints that are there, ascending."""
         names = (path.name.partition("_")[2] for path in self.folder.glob("progress_*"))
         return sorted(int(name) for name in names if name.isdecimal())
 
     def _drop_progress(self, above: int) -> None:
-        for number in self._numbers():
+        for number in self._list_numbers():
             if number > above:
-                shutil.rmtree(self._progress(number), ignore_errors=True)
+                shutil.rmtree(self._progress_folder(number), ignore_errors=True)
 
-    def _progress(self, number: int) -> Path:
+    def _progress_folder(self, number: int) -> Path:
         return self.folder / f"progress_{number:06d}"
 
-    def _segments(self, number: int) -> Path:
+    def _segments_path(self, number: int) -> Path:
         return self.folder / f"segments_{number:06d}"

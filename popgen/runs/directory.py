@@ -67,7 +67,7 @@ class RunState:
     def __init__(self, folder: Path) -> None:
         self.folder, self.began, self._past, self._attempt = folder, time.time(), 0.0, 0
         self._file = open(folder / LOCK, "a+", encoding="utf-8", errors="replace")  # noqa: SIM115 (held until the end)
-        if not _lock(self._file):
+        if not _take_lock(self._file):
             self._file.seek(0)
             holder = self._file.read(200).strip() or "another process"
             self._file.close()
@@ -90,23 +90,23 @@ class RunState:
     def start(self, attempt: int) -> None:
         """The attempt begins."""
         try:
-            self._past = _seconds(self.folder, read_state(self.folder))
+            self._past = _sum_seconds(self.folder, read_state(self.folder))
         except (OSError, ValueError, OverflowError, RecursionError):
             self._past = 0.0  # a damaged file costs the time of earlier attempts, and nothing else
         self.began, self._attempt = time.time(), attempt
-        self._write("running")
+        self._write_state("running")
 
     def end(self, status: str, error: BaseException | None = None) -> None:
         """It ended with an MLflow status; the lock is given up."""
         text = None if error is None else " ".join((str(error) or type(error).__name__).split())[:500]
-        self._write(OUTCOMES[status], text)
+        self._write_state(OUTCOMES[status], text)
         self.release()
 
     def release(self) -> None:
         """Give up the lock, for the next attempt of this process: the state stays what it is."""
         self._file.close()
 
-    def _write(self, state: str, error: str | None = None) -> None:
+    def _write_state(self, state: str, error: str | None = None) -> None:
         now = time.time()
         values = {
             "state": state,
@@ -120,7 +120,7 @@ class RunState:
         replace_file(self.folder / STATE, json.dumps(values).encode())
 
 
-def _lock(file: TextIO) -> bool:
+def _take_lock(file: TextIO) -> bool:
     """Take the lock for the file's life; False if another process holds it.
 
     A record lock: it belongs to the process, no child inherits it, and NFS carries it to other hosts. Where the file
@@ -157,36 +157,38 @@ def describe_run(folder: Path) -> dict[str, Any]:
     attempts; attempt; began (of the last attempt, seconds since 1970); error (of the last attempt, None without one).
     A folder with a file that cannot be read is "damaged", and `error` names it.
     """
-    known: dict[str, Any] = {"id": _plain(folder.name), "state": "damaged", "method": None, "scale": None}
+    known: dict[str, Any] = {"id": _strip_controls(folder.name), "state": "damaged", "method": None, "scale": None}
     known |= {"environment": None, "member": None, "size": None, "steps": {}, "total_steps": 0}
     known |= {"seconds": 0.0, "attempt": None, "began": None, "error": None}
     path = folder / "config.json"
     try:
         config = json.loads(read_regular(path))
         named = {"method": config["method"], "scale": config["scale"], "environment": config["env"]["name"]}
-        known |= {key: _plain(value) for key, value in named.items()} | {"size": int(config["population"]["size"])}
+        known |= {key: _strip_controls(value) for key, value in named.items()} | {
+            "size": int(config["population"]["size"])
+        }
         path = folder / STATE
         state = read_state(folder)
-        known |= {"seconds": _seconds(folder, state), "attempt": state.get("attempt"), "began": state.get("began")}
+        known |= {"seconds": _sum_seconds(folder, state), "attempt": state.get("attempt"), "began": state.get("began")}
         path = folder / "population" / "manifest.json"
         members = len(json.loads(read_regular(path))["members"]) if path.exists() else 0
         known["member"] = min(members + 1, known["size"])
         path = folder / "ledger.jsonl"
-        known["steps"] = _steps(path)
+        known["steps"] = _count_steps(path)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        return known | {"error": f"{path.relative_to(folder)} cannot be read ({_reason(error)})"}
+        return known | {"error": f"{path.relative_to(folder)} cannot be read ({_describe_reason(error)})"}
     done = members >= known["size"] and (folder / "report" / "crossplay.json").exists()
     told = state.get("error")
-    known |= {"state": _present(folder, state, done), "error": None if told is None else _plain(told)}
+    known |= {"state": _present_state(folder, state, done), "error": None if told is None else _strip_controls(told)}
     return known | {"total_steps": sum(known["steps"].values())}
 
 
-def _plain(value: Any) -> str:
+def _strip_controls(value: Any) -> str:
     """Text in one line that a terminal takes for text: what other programs wrote may hold control characters."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(value))
 
 
-def _present(folder: Path, state: dict[str, Any], done: bool) -> str:
+def _present_state(folder: Path, state: dict[str, Any], done: bool) -> str:
     told = state.get("state")
     if told == "running":
         return "running" if _is_alive(folder / LOCK, state) else "interrupted"
@@ -230,7 +232,7 @@ def read_state(folder: Path) -> dict[str, Any]:
     return state
 
 
-def _seconds(folder: Path, state: dict[str, Any]) -> float:
+def _sum_seconds(folder: Path, state: dict[str, Any]) -> float:
     """Of all attempts; one that ended without a word lasted until it was last heard of."""
     known = float(state.get("seconds") or 0.0)
     if state.get("state") != "running":
@@ -239,18 +241,18 @@ def _seconds(folder: Path, state: dict[str, Any]) -> float:
     return round(known + max(0.0, heard - float(state.get("began") or heard)), 1)
 
 
-def _steps(ledger: Path) -> dict[str, int]:
+def _count_steps(ledger: Path) -> dict[str, int]:
     """Environment steps by kind; a line that is still being written does not count."""
     steps: Counter[str] = Counter()
     whole = read_regular(ledger).rpartition(b"\n")[0] if ledger.exists() else b""
     for line in whole.splitlines():
         entry = json.loads(line)
-        steps[_plain(entry["kind"])] += int(entry["steps"])
+        steps[_strip_controls(entry["kind"])] += int(entry["steps"])
     return dict(steps)
 
 
-def _reason(error: Exception) -> str:
+def _describe_reason(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"it has no {error.args[0]!r}"
     text = getattr(error, "strerror", None) or str(error)
-    return _plain(" ".join(text.split())[:120]) or type(error).__name__
+    return _strip_controls(" ".join(text.split())[:120]) or type(error).__name__

@@ -40,7 +40,7 @@ class Ledger:
         self._totals: dict[tuple[int, Kind], list[float]] = defaultdict(lambda: [0, 0, 0.0])
         self._pending: list[str] = []
         if self.path is not None and self.path.exists():
-            self._load(self.path)
+            self._load_entries(self.path)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -64,10 +64,10 @@ class Ledger:
             episodes=int(entry.episodes),
             score=float(entry.score),
         )
-        if not self._keep(entry):
+        if not self._count_entry(entry):
             return False
         if self.path is not None:
-            self._pending.append(_line(entry))
+            self._pending.append(_entry_line(entry))
         return True
 
     def flush(self) -> None:
@@ -108,21 +108,21 @@ class Ledger:
         self.flush()
         if self.path is not None:
             with open(self.path.with_suffix(".lost.jsonl"), "a") as file:
-                file.writelines(_line(entry) for entry in lost)
-            replace_file(self.path, "".join(_line(entry) for entry in entries[:count]).encode())
+                file.writelines(_entry_line(entry) for entry in lost)
+            replace_file(self.path, "".join(_entry_line(entry) for entry in entries[:count]).encode())
         self._entries.clear()
         self._totals.clear()
         for entry in entries[:count]:
-            self._keep(entry)
+            self._count_entry(entry)
         return len(lost)
 
     def steps(self, member: int | None = None, kind: Kind | str | None = None) -> int:
         """Environment steps, of one member, of one kind, or of all."""
-        return int(sum(total[0] for total in self._select(member, kind)))
+        return int(sum(total[0] for total in self._select_totals(member, kind)))
 
     def episodes(self, member: int | None = None, kind: Kind | str | None = None) -> int:
         """Finished episodes, of one member, of one kind, or of all."""
-        return int(sum(total[1] for total in self._select(member, kind)))
+        return int(sum(total[1] for total in self._select_totals(member, kind)))
 
     def table(self) -> dict[str, dict[str, int]]:
         """Environment steps: member -> kind -> steps, with a `total` in each row and a row `total`; JSON-able."""
@@ -145,13 +145,13 @@ class Ledger:
             for (member, kind), (steps, episodes, score) in sorted(self._totals.items()):
                 writer.writerow([member, str(kind), int(steps), int(episodes), score])
 
-    def _select(self, member: int | None, kind: Kind | str | None) -> Iterator[list[float]]:
+    def _select_totals(self, member: int | None, kind: Kind | str | None) -> Iterator[list[float]]:
         wanted = None if kind is None else Kind(kind)
         for (who, what), total in self._totals.items():
             if member in (None, who) and wanted in (None, what):
                 yield total
 
-    def _keep(self, entry: LedgerEntry) -> bool:
+    def _count_entry(self, entry: LedgerEntry) -> bool:
         known = self._entries.get(entry.key)
         if known is not None:
             if known != entry:
@@ -166,7 +166,7 @@ class Ledger:
         total[2] += entry.score
         return True
 
-    def _load(self, path: Path) -> None:
+    def _load_entries(self, path: Path) -> None:
         data = path.read_bytes()
         whole = data.rfind(b"\n") + 1
         if whole < len(data):
@@ -174,13 +174,13 @@ class Ledger:
             os.truncate(path, whole)
         for number, line in enumerate(data[:whole].splitlines(), start=1):
             try:
-                self._keep(_entry(json.loads(line)))
+                self._count_entry(_parse_entry(json.loads(line)))
             except (ValueError, TypeError, KeyError, RecursionError, LedgerConflict) as error:
                 fix = "restore the file from a copy, or start a new run"
                 raise UserError("ledger", f"{path} line {number} is no ledger entry ({error})", fix) from None
 
 
-def _line(entry: LedgerEntry) -> str:
+def _entry_line(entry: LedgerEntry) -> str:
     return json.dumps(asdict(entry)) + "\n"
 
 
@@ -188,7 +188,7 @@ _FIELDS = {field.name for field in fields(LedgerEntry)}
 _TYPES = {"run": str, "member": int, "sampler": str, "sequence": int, "steps": int, "episodes": int, "score": float}
 
 
-def _entry(values: dict[str, Any]) -> LedgerEntry:
+def _parse_entry(values: dict[str, Any]) -> LedgerEntry:
     if not isinstance(values, dict) or set(values) != _FIELDS:
         raise ValueError(f"expected the fields {', '.join(sorted(_FIELDS))}")
     for name, kind in _TYPES.items():

@@ -96,7 +96,7 @@ class Tracker:
         self._resumed = resume is not None
         self._experiment = ""
         if config.enabled:
-            self._open(params or {})
+            self._open_store(params or {})
 
     @property
     def enabled(self) -> bool:
@@ -131,14 +131,16 @@ class Tracker:
         path = Path(path)
         send = self._client.log_artifacts if path.is_dir() else self._client.log_artifact
         # Each kind of artefact store raises errors of its own.
-        self._try(lambda: send(self._run(member), str(path), folder), Exception)
+        self._try_write(lambda: send(self._find_run(member), str(path), folder), Exception)
 
     def flush(self) -> None:
         """Write everything buffered, `BATCH` points a call."""
         for member, points in self._points.items():
             while points:
                 batch = points[:BATCH]
-                if not self._try(lambda m=member, batch=batch: self._client.log_batch(self._run(m), metrics=batch)):
+                if not self._try_write(
+                    lambda m=member, batch=batch: self._client.log_batch(self._find_run(m), metrics=batch)
+                ):
                     del points[: max(0, len(points) - KEPT)]
                     break
                 del points[:BATCH]
@@ -155,9 +157,9 @@ class Tracker:
             self._monitor.finish()
         self.flush()
         for run in reversed(self._runs.values()):
-            self._try(lambda run=run: self._client.set_terminated(run, status=status))
+            self._try_write(lambda run=run: self._client.set_terminated(run, status=status))
 
-    def _open(self, params: Mapping[str, Any]) -> None:
+    def _open_store(self, params: Mapping[str, Any]) -> None:
         os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
         from mlflow.exceptions import MlflowException
         from mlflow.tracking import MlflowClient
@@ -170,12 +172,12 @@ class Tracker:
             self._client = MlflowClient(tracking_uri=self.uri)
             self._experiment = self._find_experiment()
             known = "parent" in self._runs
-            parent = self._run(None)
+            parent = self._find_run(None)
         except (MlflowException, OSError, ImportError) as error:
             first = str(error).strip().partition("\n")[0]
             raise UserError("tracking.uri", f"cannot open {self.uri} ({first})", "or use tracking=off") from None
         if known:
-            self._try(lambda: self._client.update_run(parent, status="RUNNING"))
+            self._try_write(lambda: self._client.update_run(parent, status="RUNNING"))
         else:
             self._log_params(parent, params)
         if self.config.system_metrics:
@@ -203,20 +205,20 @@ class Tracker:
                     raise
         return found.experiment_id
 
-    def _run(self, member: int | None) -> str:
+    def _find_run(self, member: int | None) -> str:
         """MLflow id of the parent run or of a member's nested run, made when first needed."""
         key = "parent" if member is None else f"member_{member:03d}"
-        if key not in self._runs and self._resumed and (found := self._search(member)):
+        if key not in self._runs and self._resumed and (found := self._search_run(member)):
             self._runs[key] = found
         if key not in self._runs:
             tags = {"popgen.run": self.run_name}
             if member is not None:
-                tags |= {"mlflow.parentRunId": self._run(None), "popgen.member": str(member)}
+                tags |= {"mlflow.parentRunId": self._find_run(None), "popgen.member": str(member)}
             name = self.run_name if member is None else f"{self.run_name}/{key}"
             self._runs[key] = self._client.create_run(self._experiment, tags=tags, run_name=name).info.run_id
         return self._runs[key]
 
-    def _search(self, member: int | None) -> str | None:
+    def _search_run(self, member: int | None) -> str | None:
         """A run that an earlier tracker made, and died before anybody learned of it."""
         tags = f"tags.`popgen.run` = '{self.run_name}'"
         if member is not None:
@@ -227,11 +229,11 @@ class Tracker:
     def _log_params(self, run: str, params: Mapping[str, Any]) -> None:
         from mlflow.entities import Param
 
-        flat = [Param(name, str(value)[:500]) for name, value in _flatten(params)]
+        flat = [Param(name, str(value)[:500]) for name, value in _flatten_params(params)]
         for start in range(0, len(flat), 100):
-            self._try(lambda start=start: self._client.log_batch(run, params=flat[start : start + 100]))
+            self._try_write(lambda start=start: self._client.log_batch(run, params=flat[start : start + 100]))
 
-    def _try(self, call: Any, *errors: type[Exception]) -> bool:
+    def _try_write(self, call: Any, *errors: type[Exception]) -> bool:
         from mlflow.exceptions import MlflowException
 
         try:
@@ -296,9 +298,9 @@ class LocalTracker:
             self._tracker = None
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten_params(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
-            yield from _flatten(value, f"{prefix}{name}.")
+            yield from _flatten_params(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value

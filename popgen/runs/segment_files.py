@@ -28,7 +28,7 @@ def save_segments(path: Path, segments: list[Segment], owner: int) -> None:
     }
     marks = [[str(s.kind), list(s.members), s.sampler, s.sequence] for s in segments]
     said = {"owner": str(owner), "segments": json.dumps(marks)}
-    data = save(arrays, metadata={**said, "sha256": _digest(arrays, said)})
+    data = save(arrays, metadata={**said, "sha256": _digest_segments(arrays, said)})
     write_file(path, data)
 
 
@@ -42,7 +42,7 @@ def load_segments(path: Path) -> tuple[list[Segment], int]:
         with safe_open(str(path), "numpy") as file:
             metadata = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
-            if metadata.get("sha256", _digest(arrays, metadata)) != _digest(arrays, metadata):
+            if metadata.get("sha256", _digest_segments(arrays, metadata)) != _digest_segments(arrays, metadata):
                 raise ValueError("they are not what was written")
             marks = json.loads(metadata["segments"])
             segments = [
@@ -60,7 +60,7 @@ def load_segments(path: Path) -> tuple[list[Segment], int]:
         raise UserError(str(path), f"unreadable segments ({error})", "remove checkpoints/progress") from None
 
 
-def _digest(arrays: Mapping[str, np.ndarray], said: Mapping[str, str]) -> str:
+def _digest_segments(arrays: Mapping[str, np.ndarray], said: Mapping[str, str]) -> str:
     """sha256 of the marks and, by name, of the arrays."""
     digest = hashlib.sha256(f"{said['owner']} {said['segments']}".encode())
     for name in sorted(arrays):

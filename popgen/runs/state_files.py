@@ -33,19 +33,19 @@ def save_state(folder: str | Path, state: dict[str, Any]) -> None:
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     arrays: dict[str, np.ndarray] = {}
-    values = _split(state, "", arrays)
+    values = _split_state(state, "", arrays)
     try:
         # Not safetensors' own writer, whose errors tell nothing of the disk.
         data = save(arrays)
-        digests = {"arrays": _sha256(data), "values": _sha256(_text(values))}
+        digests = {"arrays": _sha256(data), "values": _sha256(_encode_values(values))}
         document = {"format": FORMAT, "sha256": digests, "values": values}
-        for name, content in ((ARRAYS, data), (VALUES, _text(document))):
+        for name, content in ((ARRAYS, data), (VALUES, _encode_values(document))):
             write_file(fresh / name, content)
         sync_folder(fresh)
     except OSError:
         shutil.rmtree(fresh, ignore_errors=True)
         raise
-    old = _old(folder)
+    old = _old_folder(folder)
     if folder.exists():
         shutil.rmtree(old, ignore_errors=True)
         folder.rename(old)
@@ -61,10 +61,10 @@ def load_state(folder: str | Path) -> dict[str, Any]:
         UserError: missing or damaged files, or those of another version.
     """
     folder = Path(folder)
-    whole = folder if folder.exists() else _old(folder)
+    whole = folder if folder.exists() else _old_folder(folder)
     try:
         data = read_regular(whole / ARRAYS)
-        state = _merge(_checked(json.loads(read_regular(whole / VALUES)), data), load(data))
+        state = _merge_state(_check_digests(json.loads(read_regular(whole / VALUES)), data), load(data))
         if not isinstance(state, dict):
             raise ValueError(f"{VALUES} holds no dictionary")
         return state
@@ -72,19 +72,19 @@ def load_state(folder: str | Path) -> dict[str, Any]:
         raise UserError(str(folder), f"unreadable checkpoint ({error})", "remove it or start a new run") from None
 
 
-def _checked(document: Any, data: bytes) -> Any:
+def _check_digests(document: Any, data: bytes) -> Any:
     """The values of a document whose digests are right."""
     known = document.get("format") if isinstance(document, dict) else None
     if known != FORMAT:
         raise ValueError(f"of format {known!r}, this version reads {FORMAT}")
     values = document["values"]
-    for name, content in (("arrays", data), ("values", _text(values))):
+    for name, content in (("arrays", data), ("values", _encode_values(values))):
         if document["sha256"][name] != _sha256(content):
             raise ValueError(f"its {name} are not what was written")
     return values
 
 
-def _text(values: Any) -> bytes:
+def _encode_values(values: Any) -> bytes:
     return json.dumps(values).encode()
 
 
@@ -92,27 +92,27 @@ def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _old(folder: Path) -> Path:
+def _old_folder(folder: Path) -> Path:
     """Where the old contents are for the moment between the two renames of `save_state`."""
     return folder.with_name(folder.name + ".old")
 
 
-def _split(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+def _split_state(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, np.ndarray):
         arrays[path] = np.asarray(value, order="C")
         return {"__array__": path}
     if isinstance(value, dict):
-        return {str(key): _split(item, f"{path}/{key}", arrays) for key, item in value.items()}
+        return {str(key): _split_state(item, f"{path}/{key}", arrays) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_split(item, f"{path}/{index}", arrays) for index, item in enumerate(value)]
+        return [_split_state(item, f"{path}/{index}", arrays) for index, item in enumerate(value)]
     return value
 
 
-def _merge(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _merge_state(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, dict):
         if set(value) == {"__array__"}:
             return arrays[value["__array__"]]
-        return {key: _merge(item, arrays) for key, item in value.items()}
+        return {key: _merge_state(item, arrays) for key, item in value.items()}
     if isinstance(value, list):
-        return [_merge(item, arrays) for item in value]
+        return [_merge_state(item, arrays) for item in value]
     return value

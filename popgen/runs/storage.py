@@ -86,48 +86,48 @@ class Mirror:
             OSError: the storage does not take it; the last copy is whole.
         """
         if self._held is None:
-            self._prepare()
+            self._list_objects()
         files: dict[str, list[Any]] = {}
         for path in sorted(self.folder.rglob("*")):
             name = path.relative_to(self.folder).as_posix()
             passing = any(part.endswith(_PASSING) for part in PurePosixPath(name).parts)
             if path.is_file() and not passing and name not in _LEFT_OUT:
-                files[name] = self._send(path, name)
+                files[name] = self._upload_file(path, name)
         document = {"format": FORMAT, "writer": self.writer, "files": files}
-        self._replace(LATEST, json.dumps(document).encode())
-        self._sweep({digest for digest, _ in files.values()})
+        self._replace_object(LATEST, json.dumps(document).encode())
+        self._remove_unneeded({digest for digest, _ in files.values()})
 
-    def _prepare(self) -> None:
+    def _list_objects(self) -> None:
         """Which objects are there, and which of them the present copy needs."""
         from pyarrow.fs import FileSelector
 
         self.system.create_dir(f"{self.path}/{OBJECTS}", recursive=True)
         found = self.system.get_file_info(FileSelector(f"{self.path}/{OBJECTS}", allow_not_found=True))
         self._held = {PurePosixPath(info.path).name for info in found}
-        document = self._latest()
+        document = self._read_latest()
         self._before = {digest for digest, _ in document["files"].values()} if document else set()
-        self._mark(self.folder, self.writer)
+        self._write_mark(self.folder, self.writer)
 
-    def _mark(self, folder: Path, writer: str) -> None:
+    def _write_mark(self, folder: Path, writer: str) -> None:
         """Note in the folder whose copy it is up to."""
         replace_file(folder / MARK, json.dumps({"writer": writer}).encode())
 
-    def _send(self, path: Path, name: str) -> list[Any]:
+    def _upload_file(self, path: Path, name: str) -> list[Any]:
         """Upload a file if its contents are not there yet; its digest and size."""
         stat = path.stat()
         known = self._known.get(name)
         if known and known[:2] == (stat.st_size, stat.st_mtime_ns):
             return [known[2], stat.st_size]
-        data = _snapshot(path) if path.suffix == ".db" else path.read_bytes()
+        data = _snapshot_database(path) if path.suffix == ".db" else path.read_bytes()
         digest = hashlib.sha256(data).hexdigest()
         assert self._held is not None
         if digest not in self._held:
-            self._replace(f"{OBJECTS}/{digest}", data)
+            self._replace_object(f"{OBJECTS}/{digest}", data)
             self._held.add(digest)
         self._known[name] = (stat.st_size, stat.st_mtime_ns, digest)
         return [digest, len(data)]
 
-    def _replace(self, name: str, data: bytes) -> None:
+    def _replace_object(self, name: str, data: bytes) -> None:
         """The old contents or the new: object stores replace at once, files are renamed."""
         target = f"{self.path}/{name}"
         local = self.system.type_name == "local"
@@ -136,7 +136,7 @@ class Mirror:
         if local:
             self.system.move(f"{target}.writing", target)
 
-    def _sweep(self, needed: set[str]) -> None:
+    def _remove_unneeded(self, needed: set[str]) -> None:
         """Remove what neither this copy nor the one before needs: somebody may be reading that."""
         assert self._held is not None
         for digest in self._held - needed - self._before:
@@ -155,15 +155,15 @@ class Mirror:
         Raises:
             UserError: the copy is damaged or of another version, or the storage cannot be read.
         """
-        document = self._latest()
-        if document is None or document["writer"] == self._wrote():
+        document = self._read_latest()
+        if document is None or document["writer"] == self._read_mark():
             return None
         fresh = self.folder.with_name(self.folder.name + ".restoring")
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir(parents=True)
         for name, (digest, _) in document["files"].items():
-            self._fetch(fresh, name, digest)
-        self._mark(fresh, document["writer"])
+            self._fetch_object(fresh, name, digest)
+        self._write_mark(fresh, document["writer"])
         told = f"restored from {self.uri}"
         if self.folder.exists():
             aside = next(
@@ -174,13 +174,13 @@ class Mirror:
         fresh.rename(self.folder)
         return told
 
-    def _wrote(self) -> str | None:
+    def _read_mark(self) -> str | None:
         try:
             return str(json.loads(read_regular(self.folder / MARK))["writer"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
 
-    def _latest(self) -> dict[str, Any] | None:
+    def _read_latest(self) -> dict[str, Any] | None:
         from pyarrow.fs import FileType
 
         target = f"{self.path}/{LATEST}"
@@ -199,7 +199,7 @@ class Mirror:
                 "run.storage", f"{self.uri}/{LATEST} is unreadable ({error})", "choose another id"
             ) from None
 
-    def _fetch(self, root: Path, name: str, digest: str) -> None:
+    def _fetch_object(self, root: Path, name: str, digest: str) -> None:
         try:
             with self.system.open_input_stream(f"{self.path}/{OBJECTS}/{digest}") as stream:
                 data = stream.read()
@@ -221,7 +221,7 @@ def _check_names(name: str, digest: str) -> None:
         raise ValueError(f"{digest!r} is no sha256")
 
 
-def _snapshot(path: Path) -> bytes:
+def _snapshot_database(path: Path) -> bytes:
     """A consistent copy of a sqlite file that another process may be writing to."""
     copy = path.with_name(path.name + ".writing")
     copy.unlink(missing_ok=True)

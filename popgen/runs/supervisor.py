@@ -48,11 +48,11 @@ def guarded(folder: Path, retries: int) -> int | None:
     if not sys.platform.startswith("linux"):
         return None
     spent, most = 0, -1
-    while (pid := _fork()) != 0:
-        code = _wait(pid)
+    while (pid := _fork_child()) != 0:
+        code = _wait_for_child(pid)
         if not _without_a_word(folder, pid, code):
             return _same_end(code)
-        done = _size(folder / "ledger.jsonl")
+        done = _file_size(folder / "ledger.jsonl")
         spent, most = 1 if done > most else spent + 1, max(most, done)
         if spent > retries:
             problem = f"Ray ended the driver {spent} times in a row without progress"
@@ -61,7 +61,7 @@ def guarded(folder: Path, retries: int) -> int | None:
     return None
 
 
-def _fork() -> int:
+def _fork_child() -> int:
     """The child's id in this process, 0 in the child."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -75,7 +75,7 @@ def _fork() -> int:
     return 0
 
 
-def _wait(pid: int) -> int:
+def _wait_for_child(pid: int) -> int:
     """The child's exit code, or less the number of the signal that ended it; signals are forwarded meanwhile."""
 
     def forward(number: int, frame: FrameType | None) -> None:
@@ -112,5 +112,5 @@ def _same_end(code: int) -> int:
     return code
 
 
-def _size(path: Path) -> int:
+def _file_size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0

@@ -50,8 +50,8 @@ def test_a_lost_folder_comes_back(tmp_path: Path, place: str) -> None:
 def test_only_what_changed_is_sent_and_what_nobody_needs_is_removed(tmp_path: Path, place: str) -> None:
     run, sent = make_run(tmp_path), []
     mirror = Mirror(run, place)
-    replace = mirror._replace
-    mirror._replace = lambda name, data: (sent.append(name), replace(name, data))[1]  # type: ignore[method-assign]
+    replace = mirror._replace_object
+    mirror._replace_object = lambda name, data: (sent.append(name), replace(name, data))[1]  # type: ignore[method-assign]
     mirror.push()
     assert len(sent) == 3 and sent[-1] == LATEST
     sent.clear()
@@ -69,14 +69,14 @@ def test_a_copy_that_was_interrupted_leaves_the_one_before(tmp_path: Path, place
     mirror.push()
     before = contents(run)
     (run / "ledger.jsonl").write_text("two\n")
-    replace = mirror._replace
+    replace = mirror._replace_object
 
     def dies(name: str, data: bytes) -> None:
         if name == LATEST:
             raise OSError("unplugged")
         replace(name, data)
 
-    mirror._replace = dies  # type: ignore[method-assign]
+    mirror._replace_object = dies  # type: ignore[method-assign]
     with pytest.raises(OSError, match="unplugged"):
         mirror.push()
     shutil.rmtree(run)
