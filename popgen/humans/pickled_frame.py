@@ -7,8 +7,10 @@ values. A class or function is only a name in it, and only the eight names that 
 
 from __future__ import annotations
 
+import io
 import pickletools
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +64,29 @@ _LITERALS = frozenset({"BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINB
 _TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
+_ACTIONS = frozenset(
+    {
+        *("PROTO", "FRAME", "STOP", "MEMOIZE", "BINGET", "LONG_BINGET", "MARK", "TUPLE", "EMPTY_LIST", "EMPTY_DICT"),
+        *("APPEND", "APPENDS", "SETITEM", "SETITEMS", "STACK_GLOBAL", "REDUCE", "NEWOBJ", "BUILD"),
+    }
+)
+_OPCODES = {
+    ord(opcode.code): opcode
+    for opcode in pickletools.opcodes
+    if opcode.name in _LITERALS | _ACTIONS | _CONSTANTS.keys() | _TUPLES.keys()
+}
+
+
+def _read_opcodes(data: bytes) -> Iterator[tuple[str, Any]]:
+    """(name, argument) of each opcode until the last byte; one that tables do not need is not even decoded."""
+    stream = io.BytesIO(data)
+    while byte := stream.read(1):
+        opcode = _OPCODES.get(byte[0])
+        if opcode is None:
+            raise FrameError(f"holds opcode {byte[0]}, which a table does not need")
+        yield opcode.name, opcode.arg.reader(stream) if opcode.arg is not None else None
+
+
 class _TreeReader:
     """A stack machine over pickle's opcodes whose every value is plain or a `Made`."""
 
@@ -71,13 +96,13 @@ class _TreeReader:
 
     def read(self, data: bytes) -> Any:
         """The tree; raises FrameError for an opcode that tables do not need, or one that does not fit."""
-        for opcode, argument, position in pickletools.genops(data):
-            name = opcode.name
+        ended = False
+        for name, argument in _read_opcodes(data):
+            if ended:
+                raise FrameError("goes on after its end")
             if name == "STOP":
-                if len(self._stack) != 1 or position != len(data) - 1:
-                    raise FrameError("does not end where its value does")
-                return self._stack[0]
-            if name in _LITERALS:
+                ended = True
+            elif name in _LITERALS:
                 self._stack.append(argument)
             elif name in ("BINGET", "LONG_BINGET"):
                 if argument >= len(self._memo):
@@ -87,7 +112,9 @@ class _TreeReader:
                 self._memo.append(self._top())
             elif name not in ("PROTO", "FRAME"):
                 self._apply(name)
-        raise FrameError("ends too early")
+        if not ended or len(self._stack) != 1:
+            raise FrameError("does not end where its value does")
+        return self._stack[0]
 
     def _apply(self, name: str) -> None:
         if name in _CONSTANTS:
@@ -112,11 +139,10 @@ class _TreeReader:
             self._stack.append(_accepted(*self._pop(2)))
         elif name in ("REDUCE", "NEWOBJ"):
             self._make(*self._pop(2))
-        elif name == "BUILD":
+        else:
+            assert name == "BUILD"
             (state,) = self._pop(1)
             self._top(Made).state = state
-        else:
-            raise FrameError(f"holds {name}, which a table does not need")
 
     def _make(self, maker: Any, arguments: Any) -> None:
         if not isinstance(maker, Name) or not isinstance(arguments, tuple):
