@@ -63,10 +63,7 @@ def finished_run(
     ledger = Ledger(folder / "ledger.jsonl")
     times = seconds or [60.0] * len(steps)
     for member, (taken, time) in enumerate(zip(steps, times, strict=True), start=1):
-        for number, (kind, count) in enumerate(taken.items()):
-            for part, half in enumerate((count // 2, count - count // 2)):
-                entry = LedgerEntry(name, member, Kind(kind), "sampler", 2 * number + part, half, 0, 0.0)
-                ledger.record(entry)
+        _record_steps(ledger, name, member, taken)
         recorded = {kind: count for kind, count in taken.items() if kind != "simulated"}
         extra = {} if time is None else {"seconds": time}
         writer.add_member(RandomPolicy(spec.num_actions), seed=member, steps=recorded, extra=extra)
@@ -75,6 +72,13 @@ def finished_run(
     _write_metrics(folder, curves or {})
     write_scores(folder, *scores)
     return folder
+
+
+def _record_steps(ledger: Ledger, name: str, member: int, taken: Mapping[str, int]) -> None:
+    """Two entries of each kind."""
+    for number, (kind, count) in enumerate(taken.items()):
+        for part, half in enumerate((count // 2, count - count // 2)):
+            ledger.record(LedgerEntry(name, member, Kind(kind), "sampler", 2 * number + part, half, 0, 0.0))
 
 
 def _write_metrics(folder: Path, curves: Mapping[int, Curve]) -> None:
