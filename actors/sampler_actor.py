@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.config.sections import EnvConfig
@@ -14,6 +14,14 @@ from popgen.play.matches import Match
 from popgen.play.sampler import Sampler
 from popgen.policies.policy_registry import build_policy
 from popgen.types import Kind, Segment
+
+
+@runtime_checkable
+class Learning(Protocol):
+    """A policy that takes new weights while it plays."""
+
+    def load(self, weights: Weights) -> None:
+        """Act with these from now on."""
 
 
 class SamplerActor:
@@ -40,7 +48,9 @@ class SamplerActor:
             raise RuntimeError("open before collect")
         began = time.process_time()
         if member is not None and weights is not None:
-            self.sampler.policies[member].load(weights.result())
+            policy = self.sampler.policies[member]
+            assert isinstance(policy, Learning)
+            policy.load(weights.result())
         segments, episodes = self.sampler.collect(steps)
         self.sequence = self.sampler.sequence
         counts = [SegmentCount(s.kind, s.members, s.sequence, s.steps) for s in segments]

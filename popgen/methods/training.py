@@ -39,6 +39,7 @@ class Pending(Protocol[T]):
 
     def result(self) -> T:
         """Wait for it; raises what the work raised."""
+        ...
 
 
 Segments = Mapping[Kind, Pending[list[Segment]]]
@@ -238,9 +239,11 @@ class Training(Protocol):
 
     def first_of_group(self, member: int) -> int:
         """The first of the members that learn together with `member`: itself where they learn one after the other."""
+        ...
 
     def begin(self, first: int) -> tuple[int, ...]:
         """Begin with the members that learn together from `first` on; who they are."""
+        ...
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue where `checkpoint` was made; after `begin`.
@@ -255,12 +258,15 @@ class Training(Protocol):
         Raises:
             FloatingPointError: training diverged.
         """
+        ...
 
     def checkpoint(self) -> State:
         """Everything that `restore` needs; asked for at rest."""
+        ...
 
     def buffers(self) -> State:
         """Whole copies of the buffers, for a log that has become long; {} where a checkpoint needs no log."""
+        ...
 
     def close(self) -> None:
         """End all workers."""

@@ -26,6 +26,7 @@ from popgen.methods.transport import InlineTransport
 from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress
 from popgen.methods.xpm_wm.replay import KIND_CODE
 from popgen.methods.xpm_wm.train import FirstMember, LaterMember
+from popgen.methods.xpm_wm.workers import Setup
 from popgen.pipelines import population as main_job
 from popgen.pipelines.population import run_population
 from popgen.play.partner_strength import PartnerStrength
@@ -384,7 +385,7 @@ def later_member(root: Path, member: int, *overrides: str) -> LaterMember:
     archive: Any = dict.fromkeys(range(1, member))
     progress = LaterMemberProgress(PartnerStrength("max_window"))
     work: Any = None  # nothing is asked of it
-    return LaterMember(work, config, spec, member, 0, archive, progress)
+    return LaterMember(Setup(work, config, spec, member, 0, archive), progress)
 
 
 def test_every_partner_is_met_in_both_seats(root: Path) -> None:
@@ -404,7 +405,7 @@ def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
     work: Any = SimpleNamespace(update_world_model=lambda *arguments: asked.append(arguments))
     progress = FirstMemberProgress(16, plays=plays)
     spec = make_env(config.env.name, 1).spec
-    FirstMember(work, config, spec, 0, progress).update_world_model(7)
+    FirstMember(Setup(work, config, spec, 1, 0, {}), progress).update_world_model(7)
     assert asked == [(7, config.agent.starts_sp, chosen)]
 
 
@@ -414,7 +415,7 @@ def test_every_look_at_the_last_policy_has_fresh_episodes(root: Path) -> None:
     seeds: list[tuple[int, bool]] = []
     work: Any = SimpleNamespace(start_episodes=lambda matches, policies, seed, stagger: seeds.append((seed, stagger)))
     weights: Any = SimpleNamespace(acting=None)
-    first = FirstMember(work, config, make_env(config.env.name, 1).spec, 3001, FirstMemberProgress(16))
+    first = FirstMember(Setup(work, config, make_env(config.env.name, 1).spec, 1, 3001, {}), FirstMemberProgress(16))
     first.progress.published = weights
     first.start_self_play()
     for first.progress.confirmations in (1, 2):

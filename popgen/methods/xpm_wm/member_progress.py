@@ -107,6 +107,18 @@ class FirstMemberProgress:
     model: Pending[Weights] | None = None
     starts: Pending[Starts] | None = None
 
+    @property
+    def latest(self) -> MemberWeights:
+        """The weights learned last; there are some from the first update on."""
+        assert self.published is not None
+        return self.published
+
+    @property
+    def imagination(self) -> tuple[Pending[Weights], Pending[Starts]]:
+        """World model and start states to imagine with; there are some from the first update on."""
+        assert self.model is not None and self.starts is not None
+        return self.model, self.starts
+
     def add_episodes(self, episodes: Sequence[Episode]) -> None:
         """Episodes that have ended; only the last `window` count."""
         self.add_scores([e.score for e in episodes], [e.shaped for e in episodes])
@@ -118,7 +130,6 @@ class FirstMemberProgress:
 
     def to_state(self) -> State:
         """For a checkpoint."""
-        assert self.published is not None
         return {
             "rounds": self.rounds,
             "since_best": self.since_best,
@@ -129,7 +140,7 @@ class FirstMemberProgress:
             "shaped": list(self.shaped),
             "figures": dict(self.figures),
             "best": None if self.best is None else self.best.to_state(),
-            "published": self.published.to_state(),
+            "published": self.latest.to_state(),
             "model": self.model,
             "starts": self.starts,
         }
@@ -174,6 +185,11 @@ class LaterMemberProgress:
     plays: bool = False
     best: Candidate | None = None
     figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def best_shown(self) -> dict[str, float]:
+        """The best round so far, for the progress line."""
+        return {} if self.best is None else {"SP": round(self.best.sp, 2), "XP": round(self.best.xp, 2)}
 
     def to_state(self) -> State:
         """For a checkpoint, after the first round."""
@@ -233,6 +249,14 @@ def is_confirmed(score: float, phase: Phase1Config) -> bool:
     return score >= CONFIRMED * phase.target_score
 
 
+def confirm_policy(progress: FirstMemberProgress, episodes: Sequence[Episode], phase: Phase1Config) -> float:
+    """Whole episodes of the last policy alone: its score, and whether that confirms it."""
+    progress.add_episodes(episodes)
+    score = float(np.mean([episode.score for episode in episodes]))
+    progress.confirmed = is_confirmed(score, phase)
+    return score
+
+
 def window_figures(progress: FirstMemberProgress, horizon: int) -> dict[str, float]:
     """Scores and shaped reward per step of the last episodes; nothing where there are none."""
     if not progress.recent:
@@ -255,8 +279,7 @@ def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after:
 
 def choose_first(progress: FirstMemberProgress) -> Candidate:
     """The policy with the best window, unless the last one is about as good."""
-    assert progress.published is not None
-    last, best = Candidate(progress.published, mean_score(progress), 0.0), progress.best
+    last, best = Candidate(progress.latest, mean_score(progress), 0.0), progress.best
     return last if progress.confirmed or best is None or last.sp >= GOOD_ENOUGH * best.sp else best
 
 
@@ -296,3 +319,26 @@ def judge_round(
         "round": progress.rounds,
     }
     return candidate
+
+
+def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name: str) -> str:
+    """A round in a line."""
+    scores = f"SP {scored.sp:.2f}, strongest XP {scored.xp:.2f} {score_name}"
+    return f"round {progress.rounds}: {scores}, {progress.steps:,} steps"
+
+
+@dataclass(frozen=True)
+class ImaginationPlan:
+    """Agent updates of one round: how many, how many came before, share of starts from the member's own data."""
+
+    updates: int
+    done: int
+    new_share: float
+
+
+def plan_imagination(rounds: int, phase: Phase2Config) -> ImaginationPlan:
+    """Of the round after `rounds`: the first one has no data of its own, and more updates."""
+    if rounds == 0:
+        return ImaginationPlan(phase.first_updates, 0, 0.0)
+    done = phase.first_updates + (rounds - 1) * phase.updates_per_round
+    return ImaginationPlan(phase.updates_per_round, done, phase.starts_new)

@@ -10,7 +10,7 @@ from popgen.methods.training import Checkpoint, Loop, Pending, Progress, State, 
 from popgen.methods.xpm_wm.acting import WorldModelPolicy
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
-from popgen.methods.xpm_wm.workers import Workers
+from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
 from popgen.play.partner_strength import PartnerStrength
 
@@ -64,14 +64,16 @@ class XpmWmTraining:
         candidate = yield from (self._first().train(self.resumed) if self.member == FIRST else self._later().train())
         yield from self._complete(candidate)
 
+    def _setup(self) -> Setup:
+        return Setup(self.work, self.config, self.spec, self.member, self.seed, self.archive)
+
     def _first(self) -> FirstMember:
         assert isinstance(self.progress, FirstMemberProgress)
-        return FirstMember(self.work, self.config, self.spec, self.seed, self.progress)
+        return FirstMember(self._setup(), self.progress)
 
     def _later(self) -> LaterMember:
         assert isinstance(self.progress, LaterMemberProgress)
-        archive = self.archive
-        return LaterMember(self.work, self.config, self.spec, self.member, self.seed, archive, self.progress)
+        return LaterMember(self._setup(), self.progress)
 
     def _complete(self, candidate: Candidate) -> Loop:
         """The member as it is saved, with the buffers and the world model that the next one starts from."""

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+from popgen.config.sections import RunSection
 from popgen.methods.training import Pending, Work
 
 AHEAD = 1
@@ -49,6 +50,12 @@ class Overlap:
         self.began = time.perf_counter()
         self._done_at_start: dict[str, dict[str, int]] = {}
         self._rounds = 0
+
+    @staticmethod
+    def of_run(run: RunSection, samplers: Sequence[str], learners: Sequence[str], wait: Wait) -> Overlap:
+        """Of samplers, whose results come first, and learners, as the run's section says."""
+        kinds = [*samplers, *learners]
+        return Overlap(kinds, learners, schedule=run.schedule, overlap=run.overlap, wait=wait)
 
     def startable(self) -> list[str]:
         """Kinds that may start a task now."""

@@ -9,8 +9,9 @@ import numpy as np
 
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
-from popgen.methods.training import Pending, PolicySnapshot
+from popgen.methods.training import Pending, PolicySnapshot, Sampled
 from popgen.nets.weights import Weights
+from popgen.play.episodes import Episode
 from popgen.play.matches import Match
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
@@ -55,3 +56,13 @@ def later_matches(member: int, pairs: Sequence[Pair], episodes_sp: int, episodes
     counts = np.bincount(np.arange(episodes_xp) % len(pairs), minlength=len(pairs))
     cross = [Match(Kind.XP, pairs[i], int(n)) for i, n in zip(order, counts, strict=True)]
     return [self_play_match(member, episodes_sp), *cross]
+
+
+def episodes_of(sampled: Sequence[Sampled]) -> list[Episode]:
+    """The episodes that ended, in the samplers' order."""
+    return [episode for one in sampled for episode in one.collected.episodes]
+
+
+def steps_of(sampled: Sequence[Sampled]) -> int:
+    """Environment steps of all of them."""
+    return sum(one.collected.steps for one in sampled)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.start_states import Starts
@@ -143,3 +145,50 @@ class Workers(Protocol):
     def wait(self, pending: Sequence[Pending[Any]], timeout: float | None = None) -> list[Pending[Any]]:
         """Handles whose results are there: at least one, or after `timeout` seconds perhaps none."""
         ...
+
+
+class ModelReports:
+    """Now and then a report of the world model.
+
+    Args:
+        work: makes them.
+        every: rounds between two.
+        waits: take each in at once; else when it is there, and nothing waits for it.
+    """
+
+    def __init__(self, work: Workers, every: int, *, waits: bool) -> None:
+        self.work, self.every, self.timeout = work, every, None if waits else 0.0
+        self.pending: Pending[dict[str, float]] | None = None
+
+    def after_round(self, number: int) -> dict[str, float]:
+        """Figures of a report that has come in (`report/NAME`); starts one where it is time."""
+        if self.pending is None and number % self.every == 0:
+            self.pending = self.work.report_model()
+        if self.pending is None or not self.work.wait([self.pending], self.timeout):
+            return {}
+        report, self.pending = self.pending.result(), None
+        return {f"report/{name}": value for name, value in report.items()}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What one member's training is given.
+
+    Attributes:
+        work: the workers.
+        config, spec: of the run and its environment.
+        member, seed: its number and the seed of everything in it.
+        archive: acting weights of the members before it.
+    """
+
+    work: Workers
+    config: RunConfig
+    spec: EnvSpec
+    member: int
+    seed: int
+    archive: Mapping[int, Pending[Weights]]
+
+
+def named_figures(learner: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    """A learner's metrics as figures of the run: `LEARNER/NAME`."""
+    return {f"{learner}/{name}": value for name, value in metrics.items()}
