@@ -328,7 +328,8 @@ BARS = (
     Bar("attributes first set outside __init__", 0, find_late_attributes),
     Bar("cycles of imports", 0, find_import_cycles),
     Bar("num_returns of three or more", 0, find_many_returns),
-    Bar("public functions that return three values or more", 0, find_wide_tuples),
+    # PettingZoo's `step` and the key of a ledger entry.
+    Bar("public functions that return three values or more", 2, find_wide_tuples),
     Bar("positional counters", 0, find_positional_counters),
     Bar("parameters without annotation, %", 5, measure_annotations),
     Bar("public names without docstring, %", 5, measure_docstrings),

@@ -100,6 +100,21 @@ class Notes(NullReporter):
         self.notes.append(text)
 
 
+def train_members(config: RunConfig, reporter: NullReporter) -> Path:
+    """One attempt of a run's driver; its folder."""
+    spec = make_env(config.env.name, 1, **config.env.params).spec
+    recorder = RunRecorder(config, spec)
+    attempt, transport = f"{recorder.run_id}.{recorder.attempt}", RayTransport(config.cluster)
+    training = open_training(config, spec, attempt, transport)
+    files = CheckpointFiles(recorder.dir, long=training.log_rows, seconds=config.run.checkpoint_seconds)
+    try:
+        TrainingDriver(config, recorder, reporter, training, files).train_members()
+    finally:
+        training.close()
+        recorder.close("FINISHED")
+    return recorder.dir
+
+
 def launch(
     root: Path,
     name: str,
@@ -145,17 +160,8 @@ def launch(
         patch.setattr(CheckpointFiles, "save", save)
         patch.setattr(CheckpointFiles, "save_member", save_member)
         patch.setattr(RunRecorder, "add_member", add)
-        spec = make_env(config.env.name, 1, **config.env.params).spec
-        recorder = RunRecorder(config, spec)
-        attempt, transport = f"{recorder.run_id}.{recorder.attempt}", RayTransport(config.cluster)
-        training = open_training(config, spec, attempt, transport)
-        files = CheckpointFiles(recorder.dir, long=training.log_rows, seconds=config.run.checkpoint_seconds)
-        try:
-            TrainingDriver(config, recorder, reporter, training, files).train_members()
-        finally:
-            training.close()
-            recorder.close("FINISHED")
-    return Run(recorder.dir, said, reporter.notes)
+        folder = train_members(config, reporter)
+    return Run(folder, said, reporter.notes)
 
 
 SIZES = {"mappo": "population.size=2", "lipo": "population.size=3", "comedi": "population.size=3"}

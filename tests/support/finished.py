@@ -55,17 +55,15 @@ def finished_run(
     }
     config = RunConfig.parse(values)
     spec = make_env(config.env.name, 1, **config.env.params).spec
-    writer = PopulationWriter(
-        folder / "population", spec, method=method, config_digest=config.digest(), seed=seed, resume=True
-    )
+    identity = {"method": method, "config_digest": config.digest(), "seed": seed}
+    writer = PopulationWriter(folder / "population", spec, **identity, resume=True)
     (folder / "config.json").write_text(json.dumps(config.relevant()))
     (folder / "attempts.txt").write_text("2026-01-01\n")
     ledger = Ledger(folder / "ledger.jsonl")
-    times = seconds or [60.0] * len(steps)
-    for member, (taken, time) in enumerate(zip(steps, times, strict=True), start=1):
+    for member, (taken, time) in enumerate(zip(steps, seconds or [60.0] * len(steps), strict=True), start=1):
         _record_steps(ledger, name, member, taken)
         recorded = {kind: count for kind, count in taken.items() if kind != "simulated"}
-        extra = {} if time is None else {"seconds": time}
+        extra = {"seconds": time} if time is not None else {}
         writer.add_member(RandomPolicy(spec.num_actions), seed=member, steps=recorded, extra=extra)
     ledger.record(LedgerEntry(name, len(steps), Kind.EVALUATION, "evaluation", 0, 77, 1, 0.0))
     ledger.flush()
