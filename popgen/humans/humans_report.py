@@ -142,8 +142,8 @@ def to_lines(reports: Sequence[LayoutReport]) -> list[str]:
             agreement = compare_rates(report.people, rates)
             within, cells = within + agreement.within, cells + len(MEASURES)
             lines.append(
-                f"{report.layout} {half}: {team_dishes(rates):.2f} dishes (published {PUBLISHED[report.layout]}), "
-                f"{agreement.within} of {len(MEASURES)} within 1 SD, NLL {report.likelihoods[half]:.3f}"
+                f"{report.layout} {half}: {team_dishes(rates):.2f} dishes ({PUBLISHED[report.layout]} published), "
+                f"{agreement.within}/{len(MEASURES)} within 1 SD, NLL {report.likelihoods[half]:.2f}"
             )
     if cells:
         lines.append(f"within one SD of the people's: {within} of {cells} cells ({within / cells:.0%})")
