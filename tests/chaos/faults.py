@@ -18,7 +18,7 @@ from site_of_chaos import FAR, Site, end, events, until
 ACTORS = {
     "sampler": {"xpm_wm": "SamplerActor", "xpm_sim": "SamplerActor", "default": "Runner"},
     "replay": {"xpm_wm": "ReplayActor"},
-    "model learner": {"xpm_wm": "ModelActor"},
+    "model learner": {"xpm_wm": "WorldModelActor"},
     "agent learner": {"xpm_wm": "AgentActor", "xpm_sim": "SimulatedAgentActor", "default": "Learner|Algorithm|Job"},
 }
 """Who is killed -> method -> what its process is called; a method without an entry has no such actor."""
