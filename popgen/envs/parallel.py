@@ -47,17 +47,17 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
     ) -> None:
         if env.num_envs != 1:
             raise UserError("num_envs", f"a ParallelEnv shows one environment, got {env.num_envs}", "use num_envs=1")
-        _choose("view", view, tuple(env.spec.views))
-        _choose("reward", reward, REWARDS)
-        _choose("render_mode", render_mode, (None, *RENDER_MODES))
+        _check_choice("view", view, tuple(env.spec.views))
+        _check_choice("reward", reward, REWARDS)
+        _check_choice("render_mode", render_mode, (None, *RENDER_MODES))
         self.env, self.view, self.reward, self.render_mode = env, view, reward, render_mode
         self.metadata = {**type(self).metadata, "name": env.spec.name}
         self.possible_agents = [f"player_{player}" for player in range(env.spec.num_players)]
         self.agents: list[str] = []
         seen = env.spec.views[view]
-        self.observation_spaces = {agent: _space(seen, seen.shape) for agent in self.possible_agents}
+        self.observation_spaces = {agent: _make_space(seen, seen.shape) for agent in self.possible_agents}
         self.action_spaces = {agent: spaces.Discrete(env.spec.num_actions) for agent in self.possible_agents}
-        self.state_space = _space(seen, (env.spec.num_players, *seen.shape))
+        self.state_space = _make_space(seen, (env.spec.num_players, *seen.shape))
         self._weights = np.asarray(env.spec.event_weights, dtype=np.float64)
 
     def observation_space(self, agent: str) -> spaces.Space:
@@ -81,7 +81,7 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
             self.env.set_state(row[None])
         self.agents = list(self.possible_agents)
         nothing = np.zeros((len(self.agents), self.env.spec.num_events), dtype=np.uint8)
-        return self._observations(), self._infos(nothing, 0.0)
+        return self._split_observations(), self._make_infos(nothing, 0.0)
 
     def step(
         self, actions: dict[str, int]
@@ -96,17 +96,17 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
             raise RuntimeError("the episode is over: call reset before step")
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"actions: none given for {', '.join(missing)}")
-        batch = self.env.step(np.array([[_action(agent, actions[agent]) for agent in self.agents]]))
+        batch = self.env.step(np.array([[_check_action(agent, actions[agent]) for agent in self.agents]]))
         players = self.agents
-        reward = self._reward(batch)
+        reward = self._pay_team(batch)
         terminated, truncated = bool(batch.terminated[0]), bool(batch.truncated[0])
         self.agents = [] if terminated or truncated else list(self.possible_agents)
         return (
-            self._observations(),
+            self._split_observations(),
             dict.fromkeys(players, reward),
             dict.fromkeys(players, terminated),
             dict.fromkeys(players, truncated),
-            self._infos(batch.events[0], float(batch.score[0])),
+            self._make_infos(batch.events[0], float(batch.score[0])),
         )
 
     def state(self) -> np.ndarray:
@@ -119,15 +119,15 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
             return self.env.render_rgb(0)
         return self.env.render_text(0) if self.render_mode == "ansi" else None
 
-    def _observations(self) -> dict[str, np.ndarray]:
+    def _split_observations(self) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, self.state(), strict=True))
 
-    def _reward(self, batch: StepBatch) -> float:
+    def _pay_team(self, batch: StepBatch) -> float:
         if self.reward == "environment":
             return float(batch.reward[0])
         return float((batch.events[0] * self._weights).sum())
 
-    def _infos(self, events: np.ndarray, score: float) -> dict[str, dict[str, Any]]:
+    def _make_infos(self, events: np.ndarray, score: float) -> dict[str, dict[str, Any]]:
         names = self.env.spec.event_names
         return {
             agent: {"events": dict(zip(names, map(int, row), strict=True)), "score": score}
@@ -152,7 +152,7 @@ def parallel_env(
     return PopgenParallelEnv(make_env(name, 1, seed=seed, **params), view=view, reward=reward, render_mode=render_mode)
 
 
-def _action(agent: str, action: Any) -> int:
+def _check_action(agent: str, action: Any) -> int:
     """A whole number, of whatever integer type.
 
     Raises:
@@ -164,13 +164,13 @@ def _action(agent: str, action: Any) -> int:
         raise ValueError(f"actions: {agent} plays {action!r}, which is no whole number") from None
 
 
-def _space(view: ViewSpec, shape: tuple[int, ...]) -> spaces.Box:
+def _make_space(view: ViewSpec, shape: tuple[int, ...]) -> spaces.Box:
     dtype = np.dtype(view.dtype)
     high = 1.0 if view.binary else view.scale
     low = -high if np.issubdtype(dtype, np.floating) and not view.binary else 0.0
     return spaces.Box(low=dtype.type(low), high=dtype.type(high), shape=shape, dtype=dtype.type)
 
 
-def _choose(field: str, value: Any, choices: tuple[Any, ...]) -> None:
+def _check_choice(field: str, value: Any, choices: tuple[Any, ...]) -> None:
     if value not in choices:
         raise UserError(field, f"{value!r} is unknown", f"choose one of {', '.join(map(str, choices))}")

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
-from popgen.envs.drawing import canvas, disc, rectangle
+from popgen.envs.rendezvous_pictures import draw_map, draw_picture
 from popgen.errors import UserError
 from popgen.shapes import check
 from popgen.types import StepBatch
@@ -94,25 +94,26 @@ class RendezvousEnv(BatchedEnv):
         exit_reward: float | None = None,
         integration: str = "velocity_first",
     ) -> None:
-        _choice("name", variant, ("mppmr",))
-        self.timestep = _number("timestep", timestep, 0.0, _LIMIT, above=True)
-        self.damping = _number("damping", damping, 0.0, 1.0)
-        self.sensitivity = _number("sensitivity", sensitivity, 0.0, _LIMIT)
-        self.bounds = _number("bounds", bounds, 0.0, _LIMIT, above=True)
-        self.landmark_distance = _number("landmark_distance", landmark_distance, 0.0, self.bounds)
-        self.start_distance = _number("start_distance", start_distance, 0.0, self.bounds)
-        self.start_noise = _number("start_noise", start_noise, 0.0, self.bounds - self.start_distance)
-        self.horizon = _integer("horizon", horizon, 1, 1_000_000)
-        self.distance = _choice("distance", distance, ("full", "centroid"))
-        self.exit_penalty = _choice("exit_penalty", exit_penalty, ("absorbing", "none"))
-        self.integration = _choice("integration", integration, ("velocity_first", "position_first"))
+        _check_choice("name", variant, ("mppmr",))
+        self.timestep = _check_number("timestep", timestep, 0.0, _LIMIT, above=True)
+        self.damping = _check_number("damping", damping, 0.0, 1.0)
+        self.sensitivity = _check_number("sensitivity", sensitivity, 0.0, _LIMIT)
+        self.bounds = _check_number("bounds", bounds, 0.0, _LIMIT, above=True)
+        self.landmark_distance = _check_number("landmark_distance", landmark_distance, 0.0, self.bounds)
+        self.start_distance = _check_number("start_distance", start_distance, 0.0, self.bounds)
+        self.start_noise = _check_number("start_noise", start_noise, 0.0, self.bounds - self.start_distance)
+        self.horizon = _check_integer("horizon", horizon, 1, 1_000_000)
+        self.distance = _check_choice("distance", distance, ("full", "centroid"))
+        self.exit_penalty = _check_choice("exit_penalty", exit_penalty, ("absorbing", "none"))
+        self.integration = _check_choice("integration", integration, ("velocity_first", "position_first"))
         self.exit_reward = self._resolve_exit_reward(exit_reward)
-        self.num_envs = _integer("num_envs", num_envs, 1, 2**31)
+        self.num_envs = _check_integer("num_envs", num_envs, 1, 2**31)
         corner = self.landmark_distance
         self.landmarks = np.array([(x, y) for x in (-corner, corner) for y in (-corner, corner)])
-        self.spec = self._make_spec(variant)
+        self.spec = make_spec(variant, self._list_rules(), self._largest_feature())
         self._states = np.zeros((self.num_envs, STATE_SIZE))
-        self.reset(seed=_integer("seed", seed, 0, 2**63))
+        self._rng = np.random.default_rng(_check_integer("seed", seed, 0, 2**63))
+        self.reset()
 
     def _resolve_exit_reward(self, value: float | None) -> float:
         if self.exit_penalty == "none":
@@ -123,30 +124,24 @@ class RendezvousEnv(BatchedEnv):
             return 0.0
         if value is None:
             return worst_reward(self.bounds, self.landmark_distance, self.distance)
-        return _number("exit_reward", value, -_LIMIT, 0.0)
+        return _check_number("exit_reward", value, -_LIMIT, 0.0)
 
-    def _make_spec(self, variant: str) -> EnvSpec:
-        names = (
-            *("timestep", "damping", "sensitivity", "bounds", "landmark_distance", "start_distance", "start_noise"),
-            *("horizon", "distance", "exit_penalty", "exit_reward", "integration"),
-        )
-        params: dict[str, Any] = {name: getattr(self, name) for name in names}
-        rules = json.dumps({"family": "rendezvous", "version": 1, **params}, sort_keys=True)
-        view = ViewSpec(shape=(len(_SWAP),), dtype="float32", binary=False, scale=self._largest_feature(), swap=_SWAP)
-        return EnvSpec(
-            name=f"rendezvous/{variant}",
-            horizon=self.horizon,
-            num_actions=len(ACTION_NAMES),
-            action_names=ACTION_NAMES,
-            state_size=STATE_SIZE,
-            state_dtype="float64",
-            views={"features": view},
-            event_names=("leaves_bounds",),
-            event_weights=(0.0,),
-            score_name="return",
-            params=params,
-            fingerprint=hashlib.sha256(rules.encode()).hexdigest(),
-        )
+    def _list_rules(self) -> dict[str, Any]:
+        """Everything that decides what happens, by the names of the parameters."""
+        return {
+            "timestep": self.timestep,
+            "damping": self.damping,
+            "sensitivity": self.sensitivity,
+            "bounds": self.bounds,
+            "landmark_distance": self.landmark_distance,
+            "start_distance": self.start_distance,
+            "start_noise": self.start_noise,
+            "horizon": self.horizon,
+            "distance": self.distance,
+            "exit_penalty": self.exit_penalty,
+            "exit_reward": self.exit_reward,
+            "integration": self.integration,
+        }
 
     def _largest_feature(self) -> float:
         """Bound on every feature's magnitude in an episode: speed, overshoot at the exit, relative landmarks."""
@@ -188,11 +183,11 @@ class RendezvousEnv(BatchedEnv):
             raise ValueError("actions: expected whole numbers from 0 to 4")
         following = states.copy(order="C")
         bodies = following[..., :_TIME].reshape(*states.shape[:-1], 2, 4)  # a view: C order
-        self._move(bodies[..., :2], bodies[..., 2:], FORCES[actions])
+        self._move_bodies(bodies[..., :2], bodies[..., 2:], FORCES[actions])
         following[..., _TIME] += 1
-        return following, self._outcome(bodies[..., :2], following[..., _TIME])
+        return following, self._find_outcome(bodies[..., :2], following[..., _TIME])
 
-    def _move(self, position: np.ndarray, velocity: np.ndarray, force: np.ndarray) -> None:
+    def _move_bodies(self, position: np.ndarray, velocity: np.ndarray, force: np.ndarray) -> None:
         """Advance both players of all environments in place; every argument is (..., P, 2)."""
         if self.integration == "position_first":
             position += velocity * self.timestep
@@ -201,12 +196,12 @@ class RendezvousEnv(BatchedEnv):
         if self.integration == "velocity_first":
             position += velocity * self.timestep
 
-    def _outcome(self, position: np.ndarray, time: np.ndarray) -> StepBatch:
+    def _find_outcome(self, position: np.ndarray, time: np.ndarray) -> StepBatch:
         """What it gives to arrive at `position` (..., P, 2) at `time` (...)."""
         left = (np.abs(position) > self.bounds).any(axis=-1)
         terminated = left.any(axis=-1)
         penalty = np.where(terminated, np.maximum(self.horizon - time, 0.0) * self.exit_reward, 0.0)
-        reward = np.asarray(self._reward(position) + penalty, dtype=np.float32)
+        reward = np.asarray(self._reward_positions(position) + penalty, dtype=np.float32)
         return StepBatch(
             reward=reward,
             score=reward.copy(),
@@ -215,12 +210,12 @@ class RendezvousEnv(BatchedEnv):
             truncated=(time >= self.horizon) & ~terminated,
         )
 
-    def _reward(self, position: np.ndarray) -> np.ndarray:
+    def _reward_positions(self, position: np.ndarray) -> np.ndarray:
         """Joint reward (...) float64 of positions (..., P, 2), without the exit penalty."""
         first, second = position[..., 0, :], position[..., 1, :]
         centroid = (first + second) / 2.0
-        nearest = _length(self.landmarks - centroid[..., None, :]).min(axis=-1)
-        apart = _length(first - second) if self.distance == "full" else _length(first - centroid)
+        nearest = _measure_length(self.landmarks - centroid[..., None, :]).min(axis=-1)
+        apart = _measure_length(first - second) if self.distance == "full" else _measure_length(first - centroid)
         return 1.0 - nearest - apart
 
     def get_state(self, indices: np.ndarray | None = None) -> np.ndarray:
@@ -277,29 +272,34 @@ class RendezvousEnv(BatchedEnv):
 
     def render_text(self, index: int = 0) -> str:
         """A map, 31 columns by 15 rows (L landmark, 0 and 1 players, 8 both), and a line of figures."""
-        rows, columns = 15, 31
-        grid = [["."] * columns for _ in range(rows)]
-        bodies = self._states[index, :_TIME].reshape(2, 4)
-        for mark, (x, y) in [("L", point) for point in self.landmarks] + [(str(p), bodies[p, :2]) for p in range(2)]:
-            row = round((1.0 - np.clip(y / self.bounds, -1, 1)) / 2.0 * (rows - 1))
-            column = round((1.0 + np.clip(x / self.bounds, -1, 1)) / 2.0 * (columns - 1))
-            grid[row][column] = "8" if grid[row][column] == "0" else mark
-        places = "  ".join(f"player {p} ({x:+.2f}, {y:+.2f})" for p, (x, y) in enumerate(bodies[:, :2]))
-        figures = f"step {int(self._states[index, _TIME])}/{self.horizon}  {places}"
-        return "\n".join(["".join(line) for line in grid] + [figures])
+        figures = f"step {int(self._states[index, _TIME])}/{self.horizon}"
+        return draw_map(self._find_bodies(index)[:, :2], self.landmarks, self.bounds, figures)
 
     def render_rgb(self, index: int = 0) -> np.ndarray:
         """A picture (256, 256, 3) uint8: blue landmarks, a red player 0 and a green player 1, y upwards."""
-        size, edge = 256, 16
-        picture = canvas(size, size, (90, 90, 90))
-        rectangle(picture, edge, edge, size - 2 * edge, size - 2 * edge, (250, 250, 250))
-        pixels = (size - 2 * edge) / (2.0 * self.bounds)
-        bodies = self._states[index, :_TIME].reshape(2, 4)
-        marks = [(point, 10, (90, 130, 220)) for point in self.landmarks]
-        marks += [(bodies[0, :2], 7, (215, 60, 50)), (bodies[1, :2], 5, (50, 165, 80))]
-        for (x, y), radius, colour in marks:
-            disc(picture, size / 2 - y * pixels, size / 2 + x * pixels, radius, colour)
-        return picture
+        return draw_picture(self._find_bodies(index)[:, :2], self.landmarks, self.bounds)
+
+    def _find_bodies(self, index: int) -> np.ndarray:
+        return self._states[index, :_TIME].reshape(2, 4)
+
+
+def make_spec(variant: str, rules: dict[str, Any], largest: float) -> EnvSpec:
+    """The record that the rest of popgen works with; `largest` bounds the features' magnitude."""
+    facts = json.dumps({"family": "rendezvous", "version": 1, **rules}, sort_keys=True)
+    return EnvSpec(
+        name=f"rendezvous/{variant}",
+        horizon=rules["horizon"],
+        num_actions=len(ACTION_NAMES),
+        action_names=ACTION_NAMES,
+        state_size=STATE_SIZE,
+        state_dtype="float64",
+        views={"features": ViewSpec((len(_SWAP),), "float32", binary=False, scale=largest, swap=_SWAP)},
+        event_names=("leaves_bounds",),
+        event_weights=(0.0,),
+        score_name="return",
+        params=rules,
+        fingerprint=hashlib.sha256(facts.encode()).hexdigest(),
+    )
 
 
 def worst_reward(bounds: float, landmark_distance: float, distance: str = "full") -> float:
@@ -329,12 +329,12 @@ def _checked_states(states: np.ndarray) -> np.ndarray:
     return states
 
 
-def _length(vectors: np.ndarray) -> np.ndarray:
+def _measure_length(vectors: np.ndarray) -> np.ndarray:
     """Euclidean length (...) of vectors (..., 2)."""
     return np.sqrt(vectors[..., 0] * vectors[..., 0] + vectors[..., 1] * vectors[..., 1])
 
 
-def _number(name: str, value: Any, low: float, high: float, *, above: bool = False) -> float:
+def _check_number(name: str, value: Any, low: float, high: float, *, above: bool = False) -> float:
     """`value` as a float in [low, high], or in (low, high] with `above`; else UserError."""
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise UserError(f"env.{name}", f"must be a finite number, got {value!r}")
@@ -344,14 +344,14 @@ def _number(name: str, value: Any, low: float, high: float, *, above: bool = Fal
     return float(value)
 
 
-def _integer(name: str, value: Any, low: int, high: int) -> int:
+def _check_integer(name: str, value: Any, low: int, high: int) -> int:
     """`value` as an int in [low, high]; else UserError."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not low <= value <= high:
         raise UserError(f"env.{name}", f"must be a whole number from {low} to {high}, got {value!r}")
     return int(value)
 
 
-def _choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
+def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     if value not in choices:
         raise UserError(f"env.{name}", f"{value!r} is unknown", f"choose one of {', '.join(choices)}")
     return value

@@ -145,12 +145,14 @@ def to_overcooked_ai(env: OvercookedEnv, row: np.ndarray) -> OvercookedState:
         "all_orders": env.layout.config.get("start_all_orders"),
         "bonus_orders": env.layout.config.get("start_bonus_orders"),
     }
-    orders = list(config.get("all_orders") or []) or [{"ingredients": _names(soup)} for soup in env.rules.reward]
+    orders = list(config.get("all_orders") or []) or [
+        {"ingredients": _name_ingredients(soup)} for soup in env.rules.reward
+    ]
     bonus = list(config.get("bonus_orders") or [])
     return OvercookedState(players, objects, bonus, orders, timestep=row[k.TIME] + 256 * row[k.TIME + 1])
 
 
-def _names(soup: tuple[int, int]) -> list[str]:
+def _name_ingredients(soup: tuple[int, int]) -> list[str]:
     return ["onion"] * soup[0] + ["tomato"] * soup[1]
 
 

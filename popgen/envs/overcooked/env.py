@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
-import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
+from popgen.envs.contract import BatchedEnv
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked import render
-from popgen.envs.overcooked.layout import choose_cooking, load_layout
-from popgen.envs.overcooked.rules import check_orders, describe_left_out, resolve
+from popgen.envs.overcooked.kitchen_spec import Kitchen, make_spec
+from popgen.envs.overcooked.layout import Layout, choose_cooking, load_layout
+from popgen.envs.overcooked.rules import check_orders, resolve
 from popgen.envs.overcooked.start import possible_contents, start_row
 from popgen.envs.overcooked.tables import build_tables
 from popgen.errors import UserError
 from popgen.types import StepBatch
 
-ACTION_NAMES = ("north", "south", "east", "west", "stay", "interact")
-EVENT_NAMES = ("takes_ingredient", "takes_dish", "pots_ingredient", "takes_soup", "delivers_soup")
-EVENT_WEIGHTS = (1.0, 1.0, 1.0, 3.0, 12.0)
-"""The paper's events and their weights (appendix D.2); the last is that of the dearest soup of a kitchen."""
 MAX_HORIZON = 65_535
 
 
@@ -74,101 +69,16 @@ class OvercookedEnv(BatchedEnv):
         Raises:
             UserError: any of these is wrong, or the layout cannot be played.
         """
-        _check_choice("env.cooking", cooking, (None, "auto", "interact"))
-        _check_choice("env.events", events, ("dispenser", "raw"))
-        if isinstance(horizon, bool) or not isinstance(horizon, int) or not 1 <= horizon <= MAX_HORIZON:
-            raise UserError("env.horizon", f"must be a whole number from 1 to {MAX_HORIZON}, got {horizon!r}")
-        if num_envs < 1:
-            raise UserError("num_envs", f"must be at least 1, got {num_envs}")
-        self.layout = load_layout(layout, grid, rules)
-        cooking = choose_cooking(self.layout, cooking)
-        field = "env.rules" if grid is not None else "env.layout"
-        self.rules = resolve(self.layout.config, field)
-        self.cooking, self.events, self.horizon = cooking, events, horizon
+        _check_arguments(num_envs, cooking, events, horizon)
         self.num_envs = num_envs
-        self._start = start_row(self.layout, self.rules)
-        auto = cooking == "auto"
-        contents, soups = possible_contents(self.layout, self.rules, self._start, auto)
-        check_orders(self.rules, soups, field)
-        self.tables = build_tables(
-            self.layout, self.rules, contents, soups, auto=auto, raw=events == "raw", horizon=horizon
-        )
-        self.spec = self._make_spec(soups)
+        field = "env.rules" if grid is not None else "env.layout"
+        self.kitchen = _work_out(load_layout(layout, grid, rules), field, cooking, events, horizon)
+        self.layout, self.rules, self.tables = self.kitchen.layout, self.kitchen.rules, self.kitchen.tables
+        self.cooking, self.events, self.horizon = self.kitchen.cooking, events, horizon
+        self.spec = make_spec(self.kitchen)
+        self._start = self.kitchen.start
         self._states = np.empty((num_envs, len(self._start)), np.uint8)
         self.reset(seed)
-
-    def _make_spec(self, soups: list[tuple[int, int]]) -> EnvSpec:
-        layout = self.layout
-        params: dict[str, Any] = {"cooking": self.cooking, "events": self.events, "horizon": self.horizon}
-        if not layout.from_file:
-            params["grid"] = "/".join(layout.rows)
-            if layout.config:
-                params["rules"] = layout.config
-        views = {
-            "features": ViewSpec((len(self.tables.feature_names),), "uint8", True, 1.0, self._swap()),
-            "lossless": self._lossless_view(),
-        }
-        return EnvSpec(
-            name=f"overcooked/{layout.name}",
-            horizon=self.horizon,
-            num_actions=k.NUM_ACTIONS,
-            action_names=ACTION_NAMES,
-            state_size=len(self._start),
-            state_dtype="uint8",
-            views=views,
-            event_names=self._event_names(),
-            event_weights=self._event_weights(),
-            score_name="dishes",
-            params=params,
-            fingerprint=self._fingerprint(soups),
-            notes=describe_left_out(self.rules, soups, self.cooking),
-        )
-
-    def _event_names(self) -> tuple[str, ...]:
-        """One delivery event, or one for each sum that soups are worth where these differ."""
-        *others, delivery = EVENT_NAMES
-        worths = self.tables.worths
-        return (*others, delivery) if len(worths) == 1 else (*others, *(f"{delivery}_worth_{w:g}" for w in worths))
-
-    def _event_weights(self) -> tuple[float, ...]:
-        """Deliveries pay in proportion to what the game pays for the soup; a soup that it does not pay is no event."""
-        *others, delivery = EVENT_WEIGHTS
-        dearest = self.tables.worths[-1]  # infinite in one of overcooked_ai's own layouts
-        return (
-            *others,
-            *(delivery if worth == dearest else delivery * worth / dearest for worth in self.tables.worths),
-        )
-
-    def _lossless_view(self) -> ViewSpec:
-        """Ingredients and steps left to cook are counts; all other channels are 0 or 1."""
-        maxima = np.ones(k.CHANNELS)
-        maxima[k.C_IN_POT : k.C_IN_SOUP + 2] = self.rules.max_ingredients
-        maxima[k.C_COOK] = max(1, int(self.tables.meta[k.M_COOK]))
-        shape = (self.layout.width, self.layout.height, k.CHANNELS)
-        return ViewSpec(shape, "uint8", False, float(maxima.max()), maxima=tuple(maxima.tolist()))
-
-    def _swap(self) -> tuple[int, ...]:
-        """Index array that turns one player's features into the other's."""
-        meta = self.tables.meta
-        order: list[int] = []
-        start = 0
-        for size in (int(meta[k.M_FLOOR]), 4, int(meta[k.M_ITEM])):
-            order += [*range(start + size, start + 2 * size), *range(start, start + size)]
-            start += 2 * size
-        return (*order, *range(start, len(self.tables.feature_names)))
-
-    def _fingerprint(self, soups: list[tuple[int, int]]) -> str:
-        """Only what can be seen in play counts: the recipes that this kitchen can cook, not how the file wrote them."""
-        facts = {
-            "grid": list(self.layout.rows),
-            "cooking": self.cooking,
-            "events": self.events,
-            "horizon": self.horizon,
-            "ingredients": self.rules.max_ingredients,
-            "soups": [[*soup, self.rules.reward[soup], self.rules.cook_time[soup]] for soup in soups],
-            "start": self._start.tolist(),
-        }
-        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
     def reset(self, seed: int | None = None, indices: np.ndarray | None = None) -> None:
         """Start new episodes in all (or the given) environments; there is no randomness to seed."""
@@ -176,7 +86,9 @@ class OvercookedEnv(BatchedEnv):
 
     def step(self, actions: np.ndarray) -> StepBatch:
         """Play joint `actions` (N, 2); raises ValueError on a wrong shape or an unknown action."""
-        reward, score, events, truncated = self._advance(self._states, self._actions(actions, (self.num_envs, 2)))
+        reward, score, events, truncated = self._advance_states(
+            self._states, self._check_actions(actions, (self.num_envs, 2))
+        )
         return StepBatch(reward, score, events, np.zeros(self.num_envs, bool), truncated)
 
     def simulate(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, StepBatch]:
@@ -188,10 +100,12 @@ class OvercookedEnv(BatchedEnv):
         Raises:
             ValueError: wrong shape or dtype, or an unknown action.
         """
-        states = self._rows(states)
+        states = self._check_states(states)
         lead = states.shape[:-1]
         following = states.reshape(-1, states.shape[-1]).copy()
-        reward, score, events, truncated = self._advance(following, self._actions(actions, (*lead, 2)).reshape(-1, 2))
+        reward, score, events, truncated = self._advance_states(
+            following, self._check_actions(actions, (*lead, 2)).reshape(-1, 2)
+        )
         batch = StepBatch(
             reward.reshape(lead),
             score.reshape(lead),
@@ -208,7 +122,7 @@ class OvercookedEnv(BatchedEnv):
     def set_state(self, states: np.ndarray, indices: np.ndarray | None = None) -> None:
         """Continue from the given states; raises ValueError on a wrong shape or dtype."""
         target = slice(None) if indices is None else np.asarray(indices)
-        states = self._rows(states)
+        states = self._check_states(states)
         if states.shape != self._states[target].shape:
             raise ValueError(f"states: expected shape {self._states[target].shape}, got {states.shape}")
         self._states[target] = states
@@ -224,7 +138,7 @@ class OvercookedEnv(BatchedEnv):
         """
         if view not in self.spec.views:
             raise ValueError(f"view: {view!r} is none of {', '.join(self.spec.views)}")
-        states = self._rows(states)
+        states = self._check_states(states)
         shape = (*states.shape[:-1], 2, *self.spec.views[view].shape)
         if out is None:
             out = np.empty(shape, np.uint8)
@@ -261,7 +175,7 @@ class OvercookedEnv(BatchedEnv):
 
     def time(self, states: np.ndarray) -> np.ndarray:
         """Time step within the episode of any states (..., S) -> (...) int64."""
-        states = self._rows(states)
+        states = self._check_states(states)
         return states[..., k.TIME].astype(np.int64) + 256 * states[..., k.TIME + 1].astype(np.int64)
 
     def set_time(self, time: np.ndarray) -> None:
@@ -273,18 +187,18 @@ class OvercookedEnv(BatchedEnv):
 
     def render_text(self, index: int = 0) -> str:
         """One kitchen as text, seven characters a cell."""
-        return render.as_text(self, self._states[index])
+        return render.as_text(self.kitchen, self._states[index])
 
     def render_rgb(self, index: int = 0) -> np.ndarray:
         """One kitchen as an (H * 32, W * 32, 3) uint8 picture."""
-        return render.as_rgb(self, self._states[index])
+        return render.as_rgb(self.kitchen, self._states[index])
 
     @property
     def feature_names(self) -> tuple[str, ...]:
         """What each entry of `features` says, such as `self_at_1,2`."""
         return self.tables.feature_names
 
-    def _advance(
+    def _advance_states(
         self, states: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Step `states` in place; the results are new arrays, which callers may keep."""
@@ -295,19 +209,44 @@ class OvercookedEnv(BatchedEnv):
         k.step(states.reshape(-1), states.shape[1], actions, table, values, meta, reward, score, events, truncated)
         return reward, score, events, truncated
 
-    def _rows(self, states: np.ndarray) -> np.ndarray:
+    def _check_states(self, states: np.ndarray) -> np.ndarray:
         states = np.asarray(states)
         if states.dtype != np.uint8 or states.shape[-1:] != self._start.shape:
             raise ValueError(f"states: expected uint8 (..., {len(self._start)}), got {states.dtype} {states.shape}")
         return np.ascontiguousarray(states)
 
-    def _actions(self, actions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    def _check_actions(self, actions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         actions = np.asarray(actions)
         if actions.shape != shape or actions.dtype.kind not in "iu":
             raise ValueError(f"actions: expected whole numbers of shape {shape}, got {actions.dtype} {actions.shape}")
         if actions.size and (actions.max() >= k.NUM_ACTIONS or actions.min() < 0):
             raise ValueError(f"actions: must be from 0 to {k.NUM_ACTIONS - 1}")
         return np.ascontiguousarray(actions, np.uint8)
+
+
+def _check_arguments(num_envs: int, cooking: str | None, events: str, horizon: Any) -> None:
+    _check_choice("env.cooking", cooking, (None, "auto", "interact"))
+    _check_choice("env.events", events, ("dispenser", "raw"))
+    if isinstance(horizon, bool) or not isinstance(horizon, int) or not 1 <= horizon <= MAX_HORIZON:
+        raise UserError("env.horizon", f"must be a whole number from 1 to {MAX_HORIZON}, got {horizon!r}")
+    if num_envs < 1:
+        raise UserError("num_envs", f"must be at least 1, got {num_envs}")
+
+
+def _work_out(layout: Layout, field: str, cooking: str | None, events: str, horizon: int) -> Kitchen:
+    """Rules, start and tables of a layout; `field` is blamed in errors.
+
+    Raises:
+        UserError: its file contradicts `cooking`, or none of its orders can be cooked.
+    """
+    cooking = choose_cooking(layout, cooking)
+    rules = resolve(layout.config, field)
+    start = start_row(layout, rules)
+    auto = cooking == "auto"
+    contents, soups = possible_contents(layout, rules, start, auto)
+    check_orders(rules, soups, field)
+    tables = build_tables(layout, rules, contents, soups, auto=auto, raw=events == "raw", horizon=horizon)
+    return Kitchen(layout, rules, tables, start, soups, cooking, events, horizon)
 
 
 def _check_choice(field: str, value: Any, choices: tuple[str | None, ...]) -> None:

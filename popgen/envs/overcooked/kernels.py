@@ -76,7 +76,7 @@ def _use_pot(states, held, slot, table, auto):
 
 
 @njit(_nrt=False)
-def _interact(states, s, p, table, auto, raw):
+def _resolve_interact(states, s, p, table, auto, raw):
     """Resolve player p's interact in the state at states[s:]; returns the event it causes, or NO_EVENT."""
     cell = table[FACE + (states[s + ORIENT + p] & 3), states[s + p]]
     kind, slot, held = table[KIND, cell], s + table[SLOT, cell], s + HELD + p
@@ -105,7 +105,7 @@ def _interact(states, s, p, table, auto, raw):
 
 
 @njit(_nrt=False)
-def _move(states, s, first, second, table):
+def _move_players(states, s, first, second, table):
     """Turn and move both players; if they would meet or cross, both stay where they are."""
     old0, old1 = states[s], states[s + 1]
     new0, new1 = old0, old1
@@ -121,7 +121,7 @@ def _move(states, s, first, second, table):
 
 
 @njit(_nrt=False)
-def _cook(states, s, pots, table, auto):
+def _advance_pots(states, s, pots, table, auto):
     """Full pots begin by themselves under automatic cooking; cooking pots advance by one."""
     for slot in range(s + POTS, s + POTS + 2 * pots, 2):
         cooking = states[slot + 1]
@@ -149,14 +149,14 @@ def step(states, size, actions, table, values, meta, reward, score, events, trun
         for p in range(2):
             if actions[n, p] == INTERACT:
                 item = states[s + HELD + p]
-                event = _interact(states, s, p, table, auto, raw)
+                event = _resolve_interact(states, s, p, table, auto, raw)
                 if event < UNPAID_DELIVERY:
                     events[n, p, event] = 1
                 if DELIVERS_SOUP <= event < NO_EVENT:
                     total += values[item]
                     paid += 1 if values[item] > 0 else 0
-        _move(states, s, actions[n, 0], actions[n, 1], table)
-        _cook(states, s, pots, table, auto)
+        _move_players(states, s, actions[n, 0], actions[n, 1], table)
+        _advance_pots(states, s, pots, table, auto)
         time = min(states[s + TIME] + 256 * states[s + TIME + 1] + 1, 65535)
         states[s + TIME] = time & 255
         states[s + TIME + 1] = time >> 8
@@ -323,7 +323,7 @@ def _first_set(features, start, count):
 
 
 @njit(_nrt=False)
-def _bits(features, start, count):
+def _read_bits(features, start, count):
     value = 0
     for i in range(count):
         if features[start + i] != 0:
@@ -335,12 +335,12 @@ def _bits(features, start, count):
 def _decode_world(features, start, meta, codes, row):
     pots, pot_bits, cook, items = meta[M_POTS], meta[M_POT], meta[M_COOK], meta[M_ITEM]
     for i in range(pots):
-        row[POTS + 2 * i] = codes[1, _bits(features, start, pot_bits)]
+        row[POTS + 2 * i] = codes[1, _read_bits(features, start, pot_bits)]
         row[POTS + 2 * i + 1] = _first_set(features, start + pot_bits, cook) + 1
         start += pot_bits + cook
     slot = POTS + 2 * pots
     for i in range(meta[M_COUNTERS]):
-        row[slot + i] = codes[0, _bits(features, start, items)]
+        row[slot + i] = codes[0, _read_bits(features, start, items)]
         start += items
     time = max(0, meta[M_HORIZON] - URGENT_BELOW + 1) if features[start] != 0 else 0
     row[TIME] = time & 255
@@ -359,5 +359,5 @@ def decode_features(features, meta, codes, out):
         for i in range(2):
             row[i] = codes[2, max(0, _first_set(view, i * floor, floor))]
             row[ORIENT + i] = max(0, _first_set(view, 2 * floor + 4 * i, 4))
-            row[HELD + i] = codes[0, _bits(view, 2 * floor + 8 + i * items, items)]
+            row[HELD + i] = codes[0, _read_bits(view, 2 * floor + 8 + i * items, items)]
         _decode_world(view, 2 * floor + 8 + 2 * items, meta, codes, row)

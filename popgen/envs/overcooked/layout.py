@@ -55,7 +55,7 @@ class Layout:
     @cached_property
     def areas(self) -> tuple[frozenset[Cell], frozenset[Cell]]:
         """The floor cells that each player can walk to."""
-        return _flood(self, self.starts[0]), _flood(self, self.starts[1])
+        return _flood_floor(self, self.starts[0]), _flood_floor(self, self.starts[1])
 
     @property
     def floor(self) -> list[Cell]:
@@ -101,7 +101,7 @@ def load_layout(layout: str, grid: str | None = None, rules: Mapping[str, Any] |
     if grid is not None:
         if not isinstance(grid, str):
             raise UserError("env.grid", f"must be text, got {type(grid).__name__}")
-        made = Layout(layout or "custom", _rows(grid), rule_keys(rules or {}, "env.rules"), False)
+        made = Layout(layout or "custom", _split_rows(grid), rule_keys(rules or {}, "env.rules"), False)
         field = "env.grid"
     else:
         if rules:
@@ -149,8 +149,8 @@ def _from_file(layout: str) -> Layout:
         fix = f"did you mean {' or '.join(close)}?" if close else "give a layout of overcooked_ai or a .layout file"
         raise UserError("env.layout", f"unknown layout {layout!r}", fix)
     try:
-        config = _literal(path.read_text())
-        rows = _rows(config.pop("grid"))
+        config = _parse_literal(path.read_text())
+        rows = _split_rows(config.pop("grid"))
     except (OSError, SyntaxError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         fix = "write a dict with a 'grid', of Python's literals"
@@ -170,7 +170,7 @@ class _Infinities(ast.NodeTransformer):
 _JSON_WORDS = {"null": "None", "true": "True", "false": "False"}
 
 
-def _literal(text: str) -> Any:
+def _parse_literal(text: str) -> Any:
     """The value of a layout file, a literal of Python.
 
     Raises:
@@ -184,7 +184,7 @@ def _literal(text: str) -> Any:
     return ast.literal_eval(_Infinities().visit(tree))
 
 
-def _rows(text: str) -> tuple[str, ...]:
+def _split_rows(text: str) -> tuple[str, ...]:
     return tuple(row.strip() for row in text.strip().replace("/", "\n").split("\n"))
 
 
@@ -218,7 +218,7 @@ def _check_tiles(layout: Layout, field: str) -> None:
             raise UserError(field, f"has no {what}", f"add {' or '.join(mark)} where a player can reach it")
     for mark, what in TILES.items():
         for x, y in layout.cells(mark):
-            beside = [layout.rows[y + dy][x + dx] for dx, dy in DIRECTIONS if _inside(layout, x + dx, y + dy)]
+            beside = [layout.rows[y + dy][x + dx] for dx, dy in DIRECTIONS if _is_inside(layout, x + dx, y + dy)]
             part = mark == "S" and "S" in beside and layout.usable("S")  # serving areas may be more than one tile deep
             if not layout.users((x, y)) and not part:
                 raise UserError(
@@ -248,11 +248,11 @@ def _check_flow(layout: Layout, field: str) -> None:
         raise UserError(field, "no soup can be brought to a serving location", "let the players' areas share a counter")
 
 
-def _inside(layout: Layout, x: int, y: int) -> bool:
+def _is_inside(layout: Layout, x: int, y: int) -> bool:
     return 0 <= x < layout.width and 0 <= y < layout.height
 
 
-def _flood(layout: Layout, start: Cell) -> frozenset[Cell]:
+def _flood_floor(layout: Layout, start: Cell) -> frozenset[Cell]:
     seen, front = {start}, [start]
     while front:
         x, y = front.pop()

@@ -152,11 +152,11 @@ def resolve(config: Mapping[str, Any], field: str) -> Rules:
     size = config.get("max_num_ingredients", MAX_INGREDIENTS)
     if size not in range(1, MAX_INGREDIENTS + 1):
         raise UserError(field, f"max_num_ingredients must be 1 to {MAX_INGREDIENTS}, got {size!r}")
-    named = list(_recipes(config.get("start_all_orders") or [], field))
+    named = list(_read_recipes(config.get("start_all_orders") or [], field))
     # a start state brings its own orders, and an empty list means every recipe
     start = config.get("start_state")
-    orders = list(_recipes((start.get("all_orders") if start else config.get("start_all_orders")) or [], field))
-    bonus = list(_recipes((start.get("bonus_orders") if start else config.get("start_bonus_orders")) or [], field))
+    orders = list(_read_recipes((start.get("all_orders") if start else config.get("start_all_orders")) or [], field))
+    bonus = list(_read_recipes((start.get("bonus_orders") if start else config.get("start_bonus_orders")) or [], field))
     soups = [soup for soup in SOUPS if sum(soup) <= size]
     ordered = tuple(soup for soup in orders if soup in soups)
     orders = orders or soups
@@ -168,9 +168,9 @@ def resolve(config: Mapping[str, Any], field: str) -> Rules:
     factor = config.get("order_bonus", 2)
     reward, cook_time = {}, {}
     for soup in soups:
-        value = _figure(config, soup, named, "delivery_reward", "recipe_values", "value")
+        value = _read_figure(config, soup, named, "delivery_reward", "recipe_values", "value")
         reward[soup] = float(value * (factor if soup in bonus else 1)) if soup in orders else 0.0
-        cook_time[soup] = _cook_time(_figure(config, soup, named, "cook_time", "recipe_times", "time"), field)
+        cook_time[soup] = _cook_time(_read_figure(config, soup, named, "cook_time", "recipe_times", "time"), field)
     return Rules(reward, cook_time, size, ordered)
 
 
@@ -200,7 +200,7 @@ def _check_clashes(config: Mapping[str, Any], field: str) -> None:
             raise UserError(field, f"{key} must be as long as start_all_orders", "give one figure per order")
 
 
-def _recipes(orders: Iterable[Any], field: str) -> Iterable[tuple[int, int]]:
+def _read_recipes(orders: Iterable[Any], field: str) -> Iterable[tuple[int, int]]:
     for order in orders:
         try:
             names = list(order["ingredients"])
@@ -212,7 +212,9 @@ def _recipes(orders: Iterable[Any], field: str) -> Iterable[tuple[int, int]]:
         yield soup
 
 
-def _figure(config: Mapping[str, Any], soup: tuple[int, int], named: list, fixed: str, table: str, kind: str) -> Any:
+def _read_figure(
+    config: Mapping[str, Any], soup: tuple[int, int], named: list, fixed: str, table: str, kind: str
+) -> Any:
     """One recipe's value or time; in overcooked_ai a fixed figure or an ingredient's figure of 0 counts as absent."""
     if config.get(fixed):
         return config[fixed]

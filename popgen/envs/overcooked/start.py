@@ -32,7 +32,7 @@ def start_row(layout: Layout, rules: Rules) -> np.ndarray:
         row[:2] = [y * layout.width + x for x, y in layout.starts]
         return row
     try:
-        _fill(row, layout, rules, given)
+        _fill_row(row, layout, rules, given)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise UserError(
             "env.layout", f"start_state does not fit the grid ({error!r})", "correct or remove it"
@@ -40,7 +40,7 @@ def start_row(layout: Layout, rules: Rules) -> np.ndarray:
     return row
 
 
-def _fill(row: np.ndarray, layout: Layout, rules: Rules, given: Mapping[str, Any]) -> None:
+def _fill_row(row: np.ndarray, layout: Layout, rules: Rules, given: Mapping[str, Any]) -> None:
     cells = []
     for i, player in enumerate(given["players"][:2]):
         cells.append(tuple(player["position"]))
@@ -48,7 +48,7 @@ def _fill(row: np.ndarray, layout: Layout, rules: Rules, given: Mapping[str, Any
             raise ValueError("a player stands outside its area")
         row[i] = cells[i][1] * layout.width + cells[i][0]
         row[k.ORIENT + i] = DIRECTIONS.index(tuple(player["orientation"]))
-        row[k.HELD + i] = _item(player.get("held_object"))
+        row[k.HELD + i] = _read_item(player.get("held_object"))
     if len(set(cells)) != 2:
         raise ValueError("two players are needed, on different cells")
     pots, counters = layout.usable("P"), layout.usable("X")
@@ -56,28 +56,28 @@ def _fill(row: np.ndarray, layout: Layout, rules: Rules, given: Mapping[str, Any
         cell = tuple(thing["position"])
         if cell in pots:
             slot = k.POTS + 2 * pots.index(cell)
-            row[slot] = _soup(thing)
+            row[slot] = _read_soup(thing)
             tick = thing.get("cooking_tick", -1)
-            row[slot + 1] = 0 if tick < 0 else 1 + max(0, rules.cook_time[_mix(thing)] - tick)
+            row[slot + 1] = 0 if tick < 0 else 1 + max(0, rules.cook_time[_read_mix(thing)] - tick)
         else:
-            row[k.POTS + 2 * len(pots) + counters.index(cell)] = _item(thing)
+            row[k.POTS + 2 * len(pots) + counters.index(cell)] = _read_item(thing)
 
 
-def _mix(thing: Mapping[str, Any]) -> tuple[int, int]:
+def _read_mix(thing: Mapping[str, Any]) -> tuple[int, int]:
     names = [ingredient["name"] for ingredient in thing["_ingredients"]]
     return names.count("onion"), names.count("tomato")
 
 
-def _soup(thing: Mapping[str, Any]) -> int:
+def _read_soup(thing: Mapping[str, Any]) -> int:
     if thing["name"] != "soup":
         raise ValueError("only soups stand in pots")
-    return SOUP_CODE[_mix(thing)]
+    return SOUP_CODE[_read_mix(thing)]
 
 
-def _item(thing: Mapping[str, Any] | None) -> int:
+def _read_item(thing: Mapping[str, Any] | None) -> int:
     if thing is None:
         return NOTHING
-    return _soup(thing) if thing["name"] == "soup" else ITEM_CODE[thing["name"]]
+    return _read_soup(thing) if thing["name"] == "soup" else ITEM_CODE[thing["name"]]
 
 
 def possible_contents(

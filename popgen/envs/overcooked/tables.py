@@ -76,41 +76,41 @@ def build_tables(
     pot_names = _fill_bits(table, codes[1], k.POT_BIT, [SOUP_CODE[soup] for soup in contents], items_too=False)
     cook = max(1, max(rules.cook_time[soup] for soup in soups))
     floor = layout.floor
-    codes[2, : len(floor)] = [_cell(layout, cell) for cell in floor]
+    codes[2, : len(floor)] = [_index_cell(layout, cell) for cell in floor]
     codes[3, :256] = table[k.XFIRST]
     meta = np.zeros(k.NUM_META, np.int64)
     meta[k.M_POTS], meta[k.M_COUNTERS], meta[k.M_HORIZON] = len(pots), len(counters), horizon
     meta[k.M_AUTO], meta[k.M_RAW] = auto, raw
     meta[k.M_FLOOR], meta[k.M_ITEM], meta[k.M_POT], meta[k.M_COOK] = len(floor), len(item_names), len(pot_names), cook
-    names = _names(floor, item_names, pots, pot_names, cook, counters)
+    names = _name_features(floor, item_names, pots, pot_names, cook, counters)
     meta[k.M_FEATURES], meta[k.M_CELLS] = len(names), layout.width * layout.height
     return Tables(table, values, worths, meta, codes, _lossless_walls(layout), counters, pots, names)
 
 
-def _cell(layout: Layout, cell: tuple[int, int]) -> int:
+def _index_cell(layout: Layout, cell: tuple[int, int]) -> int:
     return cell[1] * layout.width + cell[0]
 
 
 def _fill_cells(table: np.ndarray, layout: Layout, pots: list, counters: list) -> None:
     for cell in [(x, y) for y in range(layout.height) for x in range(layout.width)]:
-        index = _cell(layout, cell)
+        index = _index_cell(layout, cell)
         table[k.XFIRST, index] = cell[0] * layout.height + cell[1]
         if layout.tile(cell) != " ":
             table[k.KIND, index] = KINDS[layout.tile(cell)] if layout.users(cell) else k.WALL
             continue
         for d, (dx, dy) in enumerate(DIRECTIONS):
             ahead = (cell[0] + dx, cell[1] + dy)
-            table[k.FACE + d, index] = _cell(layout, ahead)
+            table[k.FACE + d, index] = _index_cell(layout, ahead)
             if layout.tile(ahead) == " ":
-                table[k.NEXT + d, index] = _cell(layout, ahead)
+                table[k.NEXT + d, index] = _index_cell(layout, ahead)
     for i, cell in enumerate(layout.floor):
-        table[k.FLOOR, _cell(layout, cell)] = i
+        table[k.FLOOR, _index_cell(layout, cell)] = i
     for i, cell in enumerate(pots):
-        table[k.SLOT, _cell(layout, cell)] = k.POTS + 2 * i
-        table[k.POT_CELL, i] = table[k.XFIRST, _cell(layout, cell)]
+        table[k.SLOT, _index_cell(layout, cell)] = k.POTS + 2 * i
+        table[k.POT_CELL, i] = table[k.XFIRST, _index_cell(layout, cell)]
     for i, cell in enumerate(counters):
-        table[k.SLOT, _cell(layout, cell)] = k.POTS + 2 * len(pots) + i
-        table[k.COUNTER_CELL, i] = table[k.XFIRST, _cell(layout, cell)]
+        table[k.SLOT, _index_cell(layout, cell)] = k.POTS + 2 * len(pots) + i
+        table[k.COUNTER_CELL, i] = table[k.XFIRST, _index_cell(layout, cell)]
 
 
 def _fill_recipes(table: np.ndarray, rules: Rules) -> None:
@@ -139,7 +139,7 @@ def _fill_worths(table: np.ndarray, rules: Rules, soups: list[tuple[int, int]]) 
     return values, worths
 
 
-def _tests(items_too: bool) -> list[tuple[str, list[bool]]]:
+def _list_tests(items_too: bool) -> list[tuple[str, list[bool]]]:
     """Name and value per object code of every bit that may describe an object."""
     items = (("onion", k.ONION), ("tomato", k.TOMATO), ("dish", k.DISH)) if items_too else ()
     tests = [(name, [code == item for code in range(NUM_CODES)]) for name, item in items]
@@ -157,7 +157,7 @@ def _fill_bits(table: np.ndarray, inverse: np.ndarray, row: int, present: list[i
     is left out (with only one possible soup, one bit says it is there).
     """
     kept: dict[tuple[bool, ...], str] = {}
-    for name, values in _tests(items_too):
+    for name, values in _list_tests(items_too):
         pattern = tuple(values[code] for code in present)
         if any(pattern) and pattern not in kept:
             kept[pattern] = name
@@ -168,7 +168,7 @@ def _fill_bits(table: np.ndarray, inverse: np.ndarray, row: int, present: list[i
     return list(kept.values())
 
 
-def _names(
+def _name_features(
     floor: list, items: list[str], pots: list, pot_bits: list[str], cook: int, counters: list
 ) -> tuple[str, ...]:
     who, sides = ("self", "other"), ("north", "south", "east", "west")
