@@ -24,7 +24,7 @@ ORDER = (
     "pipelines",
     *("conf", "cli", "__main__"),
 )
-FORBIDDEN: set[tuple[str, str]] = set()  # whatever their place in the list
+UPWARD = {("config", "methods")}  # the one arrow that runs back up: `RunConfig` names the sections of each method
 OWNERS = {  # outside package -> folders and files where it may be imported
     "ray": ("actors", "pipelines", "popgen/methods/mappo", "popgen/runs/recovery.py", "popgen/runs/monitoring.py"),
     "hydra": ("popgen/cli/compose.py",),
@@ -84,7 +84,7 @@ def test_imports_go_one_way() -> None:
             if there is None or there == here:
                 continue
             upward = here == "__init__" or ORDER.index(there) > ORDER.index(here)
-            if upward or (here, there) in FORBIDDEN:
+            if upward and (here, there) not in UPWARD:
                 wrong.append(f"{path.relative_to(ROOT)}:{line} {here} imports {there}")
     assert not wrong, "\n".join(sorted(set(wrong)))
 
