@@ -312,7 +312,7 @@ def test_a_killed_job_submitted_again_ends_as_one_that_was_not(
     told = describe_run(run)
     assert told["state"] == "interrupted" and 0 < told["total_steps"] < STEPS
     code, out = cluster.run("run.id=killed", tracking)
-    assert code == 0 and "going on" in out, out
+    assert code == 0 and "continuing after" in out, out
     assert entries(run) == entries(unbroken) and sha256s(run) == sha256s(unbroken)
     told = describe_run(run)
     assert (told["state"], told["attempt"], told["member"]) == ("finished", 2, 1)

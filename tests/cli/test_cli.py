@@ -327,7 +327,14 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
     environment = {"name": "overcooked/cramped_room"}
     evaluation = {"environment": environment, "unit": "dishes", "members": [1, 2], "sp": figure, "xp": figure}
     evaluation["matrix"] = {"mean": [[9.0, 0.25], [None, 8.0]], "standard_error": [[0.5, 0.1], [None, 0.1]]}
-    evaluation["beside"] = {"random": {"both": figure}, "idle": {"both": figure}}
+    evaluation["beside"] = {who: dict.fromkeys(("both", "seat_0", "seat_1"), figure) for who in ("random", "idle")}
+    evaluation["obstruction"] = {"random": True, "idle": False, "pairs": []}
+    evaluation |= {"episodes": 20, "steps": {"evaluation": 4000}}
+    own = {"mean": 9.0, "standard_error": 0.5}
+    seats = [(one, other) for one in ("1", "2") for other in ("1", "2", "random", "idle")]
+    evaluation["pairs"] = [
+        {"seat_0": one, "seat_1": other, "score": own if one == other else figure} for one, other in seats
+    ]
     result["evaluation"] = evaluation
 
     def fake(config: Any, *, reporter: Any) -> dict[str, Any]:
@@ -343,7 +350,8 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
     assert json.loads(out)["matrix"]["mean"] == [[9.0, 0.25], [None, 8.0]]
     assert seen[0].scale == "smoke" and seen[0].run.root == "runs"
     code, out, _ = run("run", "scale=smoke", "--quiet")
-    assert code == 0 and "9.00 ± 0.50" in out and "1,234" in out
+    assert code == 0 and "9.00" in out and "±0.50" in out and "1,234" in out
+    assert "obstruction: XP is below play beside random partners" in out
     assert out.splitlines()[-1] == "population: runs/r/population   ledger, checkpoints and reports: runs/r"
 
 
