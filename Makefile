@@ -19,7 +19,7 @@ demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 test: install  ## all tests
 	$(PYTEST)
 
-test-fast: install  ## the tests without Ray: 90 seconds (the oracle plays 4,000 steps of each layout, not 20,000)
+test-fast: install  ## the tests without Ray (the oracle plays 4,000 steps of each layout, not 20,000)
 	POPGEN_ORACLE_STEPS=4000 $(PYTEST) -m "not ray"
 
 lint: install docs  ## style and documentation (types: `make types`)
