@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from popgen.actors.actor_setup import build_env, device_of, limit_threads
-from popgen.config.run_config import RunConfig
 from popgen.methods.transport import Transport
 from popgen.methods.xpm_wm.agent import AgentLearner
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate
 from popgen.nets.weights import Weights, prefixed, under, weights_of
@@ -20,7 +20,7 @@ from popgen.nets.weights import Weights, prefixed, under, weights_of
 class AgentActor:
     """Thin: every number is made by `AgentLearner`."""
 
-    def __init__(self, config: RunConfig, threads: int, transport: Transport) -> None:
+    def __init__(self, config: XpmWmRun, threads: int, transport: Transport) -> None:
         limit_threads(threads)
         self.config, self.transport = config, transport
         self.spec = build_env(config.env, 1).spec

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from popgen.actors.actor_setup import build_env, limit_threads
-from popgen.config.run_config import RunConfig
 from popgen.methods.training import Pending, Segments, State
 from popgen.methods.transport import Transport
 from popgen.methods.xpm_sim.agent import XpmSimLearner
+from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.restart_check import restart_check
 from popgen.methods.xpm_sim.workers import Learned, RestartCheck
 from popgen.nets.weights import Weights, weights_of
@@ -25,7 +25,7 @@ ENVS = 64
 class SimulatedAgentActor:
     """Thin: every number is made by `XpmSimLearner`."""
 
-    def __init__(self, config: RunConfig, threads: int, transport: Transport) -> None:
+    def __init__(self, config: XpmSimRun, threads: int, transport: Transport) -> None:
         limit_threads(threads)
         self.config, self.transport = config, transport
         self.env = build_env(config.env, ENVS, config.run.seed)

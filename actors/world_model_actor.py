@@ -10,9 +10,9 @@ import numpy as np
 
 from popgen.actors.actor_setup import build_env, device_of, limit_threads
 from popgen.actors.replay_actor import ReplayActor
-from popgen.config.run_config import RunConfig
 from popgen.methods.training import Pending
 from popgen.methods.transport import Transport, Worker
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.replay import Windows
 from popgen.methods.xpm_wm.start_states import OLD, Starts
@@ -31,7 +31,7 @@ class WorldModelActor:
 
     def __init__(
         self,
-        config: RunConfig,
+        config: XpmWmRun,
         seed: int,
         threads: int,
         replays: tuple[Worker[ReplayActor], Worker[ReplayActor]],

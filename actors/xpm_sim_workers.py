@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 from popgen.actors.sampler_pool import start_samplers
 from popgen.actors.simulated_agent_actor import SimulatedAgentActor
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport
+from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.train import XpmSimTraining
 from popgen.methods.xpm_sim.workers import Learned, RestartCheck
 from popgen.nets.weights import Weights
@@ -19,7 +19,7 @@ from popgen.play.matches import Match
 class XpmSimWorkers:
     """See `popgen.methods.xpm_sim.workers.Workers`."""
 
-    def __init__(self, config: RunConfig, attempt: str, transport: Transport) -> None:
+    def __init__(self, config: XpmSimRun, attempt: str, transport: Transport) -> None:
         cluster, self.transport = config.cluster, transport
         self.samplers = start_samplers(config, attempt, transport)
         place = Place(cluster.agent_cpus)
@@ -75,6 +75,6 @@ class XpmSimWorkers:
         self.learner.end()
 
 
-def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> XpmSimTraining:
+def open_training(config: XpmSimRun, spec: EnvSpec, attempt: str, transport: Transport) -> XpmSimTraining:
     """Start the workers of one attempt; see `popgen.methods.transport.OpenTraining`."""
     return XpmSimTraining(config, spec, attempt, XpmSimWorkers(config, attempt, transport))

@@ -10,10 +10,10 @@ from popgen.actors.agent_actor import AgentActor
 from popgen.actors.replay_actor import ReplayActor
 from popgen.actors.sampler_pool import start_samplers
 from popgen.actors.world_model_actor import WorldModelActor
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport, Worker
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.start_states import Starts
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelUpdate
@@ -44,7 +44,7 @@ class DelayedWeights:
 class XpmWmWorkers:
     """See `popgen.methods.xpm_wm.workers.Workers`."""
 
-    def __init__(self, config: RunConfig, attempt: str, transport: Transport) -> None:
+    def __init__(self, config: XpmWmRun, attempt: str, transport: Transport) -> None:
         self.transport, self.attempt = transport, attempt
         cluster, seed, start = config.cluster, config.run.seed * 1000, transport.start
         self.pool = start_samplers(config, attempt, transport)
@@ -190,6 +190,6 @@ class XpmWmWorkers:
             worker.end()
 
 
-def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> XpmWmTraining:
+def open_training(config: XpmWmRun, spec: EnvSpec, attempt: str, transport: Transport) -> XpmWmTraining:
     """Start the workers of one attempt; see `popgen.methods.transport.OpenTraining`."""
     return XpmWmTraining(config, spec, XpmWmWorkers(config, attempt, transport))

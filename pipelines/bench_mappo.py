@@ -9,14 +9,14 @@ import ray
 
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.actors.local_ray import start_ray
-from popgen.config.run_config import RunConfig
 from popgen.methods.mappo.algorithm import Mappo, MappoConfig
+from popgen.methods.mappo.config import MappoRun
 from popgen.methods.mappo.train import check_card
 from popgen.methods.mappo.training_job import Job
 from popgen.runs.recovery import wait_for_room
 
 
-def bench_mappo(config: RunConfig, *, seconds: float) -> dict[str, Any]:
+def bench_mappo(config: MappoRun, *, seconds: float) -> dict[str, Any]:
     """Train self-play by the config's recipe for a while; nothing is written.
 
     Args:

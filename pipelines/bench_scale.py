@@ -20,8 +20,8 @@ import ray
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.actors.local_ray import start_ray
 from popgen.actors.ray_transport import RayTransport
-from popgen.config.run_config import RunConfig
 from popgen.methods.training import Round, Work
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.train import LEARNERS
 from popgen.pipelines.population import open_checkpoints, open_training
 from popgen.pipelines.training_driver import TrainingDriver
@@ -140,7 +140,7 @@ def measure_rounds(driver: TrainingDriver, seconds: float) -> Measured:
 
 
 def bench_scale(
-    config: RunConfig, *, samplers: Sequence[int], seconds: float, tell: Callable[[str], None]
+    config: XpmWmRun, *, samplers: Sequence[int], seconds: float, tell: Callable[[str], None]
 ) -> dict[str, Any]:
     """Measure rounds of member 1 with each number of samplers, with schedule=async.
 
@@ -195,7 +195,7 @@ def _row_of(samplers: int, measured: Measured, predicted: float) -> dict[str, An
     }
 
 
-def _endless_config(config: RunConfig, samplers: int) -> RunConfig:
+def _endless_config(config: XpmWmRun, samplers: int) -> XpmWmRun:
     """`config` with so many samplers, little random play, and no end of its own."""
     envs = config.phase1.envs * samplers
     prefill = envs * max(100, config.world_model.length + 8)
@@ -207,7 +207,7 @@ def _endless_config(config: RunConfig, samplers: int) -> RunConfig:
     return config.model_copy(update={"phase1": phase, "cluster": cluster, "run": run, "tracking": tracking})
 
 
-def _measure_once(config: RunConfig, seconds: float) -> tuple[Measured, int]:
+def _measure_once(config: XpmWmRun, seconds: float) -> tuple[Measured, int]:
     """What was measured, and the bytes of a segment file of one round of one sampler."""
     root = Path(tempfile.mkdtemp(prefix="popgen-bench-"))
     config = config.model_copy(update={"run": config.run.model_copy(update={"root": str(root)})})

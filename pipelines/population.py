@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,9 @@ from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import evaluate_population
+from popgen.methods.registry import METHODS
 from popgen.methods.training import Training
-from popgen.methods.transport import InlineTransport, OpenTraining, Transport
+from popgen.methods.transport import InlineTransport, Transport
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import load_population
 from popgen.progress import Reporter
@@ -39,21 +39,10 @@ from popgen.runs.storage import Mirror
 HALT_SECONDS = 30.0
 """Least time between two checkpoints where all overlapping work halts for one."""
 
-TRAININGS: dict[str, str] = {
-    "xpm_wm": "popgen.actors.xpm_wm_workers:open_training",
-    "xpm_sim": "popgen.actors.xpm_sim_workers:open_training",
-    "mappo": "popgen.methods.mappo.train:open_training",
-    "lipo": "popgen.methods.mappo.lipo:open_training",
-    "comedi": "popgen.methods.mappo.comedi:open_training",
-}
-"""method -> `module:function`, imported when first needed (`popgen.methods.transport.OpenTraining`)."""
-
 
 def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> Training:
     """Start the workers of the run's method."""
-    module, _, name = TRAININGS[config.method].partition(":")
-    start: OpenTraining = getattr(import_module(module), name)
-    return start(config, spec, attempt, transport)
+    return METHODS[config.method].load_training()(config, spec, attempt, transport)
 
 
 def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
@@ -79,7 +68,7 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         if restored := Mirror(run_folder(config), config.run.storage).pull():
             reporter.note(restored)
     tracker_kind = RemoteTracker if config.run.transport == "ray" else LocalTracker
-    tracker = tracker_kind(config.tracking, run_folder(config), str(config.run.id), config.relevant())
+    tracker = tracker_kind(config.tracking, run_folder(config), str(config.run.id), config.as_dict())
     recorder = RunRecorder(config, spec, tracker)
     reporter.note(f"run {recorder.run_id} in {recorder.dir}")
     job = PopulationJob(config, spec, recorder, reporter)

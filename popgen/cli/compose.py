@@ -3,63 +3,172 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from popgen.cli.printing import short
 from popgen.errors import UserError
+from popgen.methods.recipe import SourcedSetting
 
 ALIASES = {"seed": "run.seed"}
 OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take any key
 
 
-def compose(overrides: Sequence[str]) -> dict[str, Any]:
-    """The plain dictionary that conf/ and the overrides give, not yet checked by the schemas.
+CHOICES = ("method", "scale", "env")
+"""Groups that decide which schema and which recipe the other settings stand on."""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A configuration and where it comes from.
+
+    Attributes:
+        values: the plain dictionary, not yet checked by the schemas.
+        recipe: what the recipe sets, by dotted field.
+        overridden: dotted fields that the command line sets.
+    """
+
+    values: dict[str, Any]
+    recipe: dict[str, SourcedSetting]
+    overridden: tuple[str, ...]
+
+
+def compose(overrides: Sequence[str], config_dir: str | None = None) -> dict[str, Any]:
+    """The plain dictionary of `compose_sources`."""
+    return compose_sources(overrides, config_dir).values
+
+
+def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> Composed:
+    """What the method's schema, the recipe, conf/ (and `config_dir`, a folder of the same form) and overrides give.
 
     Raises:
         UserError: an override that cannot be read, an unknown group option, key or interpolation.
     """
+    from popgen.config.run_config import schema_of, unknown_field
+    from popgen.methods.registry import DEFAULT_RECIPE, METHODS
+
+    folder = None if config_dir is None else _preset_folder(config_dir)
+    translated = [_translate(override) for override in overrides]
+    chosen = _choose(translated, overrides, folder)
+    schema = schema_of(chosen)
+    recipes = METHODS[chosen["method"]].recipes
+    if (name := chosen["scale"]) not in recipes and name not in group_options("scale", folder):
+        raise UserError("scale", f"{chosen['method']} has no recipe {name!r}", f"choose one of {', '.join(recipes)}")
+    recipe = recipes.get(name, recipes[DEFAULT_RECIPE])
+    base = _merge(schema.model_validate({}).as_dict(), recipe.values(chosen["env"]["name"]))
+    values = _compose(base, translated, overrides, folder, lambda key: unknown_field(key, schema))
+    keys = [override.lstrip("+").partition("=")[0] for override in translated]
+    return Composed(values, recipe.list_settings(chosen["env"]["name"]), tuple(keys))
+
+
+def _preset_folder(path: str) -> Path:
+    """A user's folder of groups.
+
+    Raises:
+        UserError: there is none.
+    """
+    folder = Path(path).absolute()
+    if not folder.is_dir():
+        raise UserError("--config-dir", f"{path} is no folder", "give one with groups such as scale/NAME.yaml")
+    return folder
+
+
+def _choose(translated: list[str], overrides: Sequence[str], folder: Path | None) -> dict[str, Any]:
+    """Method, scale and environment, which the rest stands on."""
+    keys = {word: word.lstrip("+").partition("=")[0] for word in translated}
+    first = [word for word, key in keys.items() if key in CHOICES or key.startswith("env.")]
+    base: dict[str, Any] = {"env": {"name": None, "params": {}}}
+    return _compose(base, first, overrides, folder, lambda key: UserError(key, "there is no such field"), loose=True)
+
+
+def _compose(
+    base: dict[str, Any],
+    translated: list[str],
+    overrides: Sequence[str],
+    folder: Path | None,
+    unknown: Callable[[str], UserError],
+    *,
+    loose: bool = False,
+) -> dict[str, Any]:
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
-    from hydra.core.config_store import ConfigStore
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     from popgen.conf import DIRECTORY
-    from popgen.config.run_config import RunConfig
 
-    ConfigStore.instance().store(name="schema", node=RunConfig().model_dump(mode="json"))
+    _store_groups(base, folder)
     GlobalHydra.instance().clear()
-    given = [_translate(override) for override in overrides]
+    search = [] if folder is None else [f"hydra.searchpath=[{json.dumps(folder.as_uri())}]"]
     try:
         with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
-            composed = hydra_compose("config", given)
+            composed = hydra_compose("config", [*search, *translated])
         missing = sorted(OmegaConf.missing_keys(composed))
-        values = OmegaConf.to_container(composed, resolve=True)
+        values = OmegaConf.to_container(composed, resolve=not loose)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # the last for a number as a group's option
-        raise _composition_error(error, overrides) from None
-    for key in missing or _unset(values):
-        raise UserError(key, "has no value", f"give one with {key}=VALUE")
+        raise _composition_error(error, overrides, folder, unknown) from None
     assert isinstance(values, dict)
-    values.pop("per_env", None)  # the table that conf/scale/paper.yaml looks values up in
-    return values
+    for key in [] if loose else missing or _unset(values):
+        raise UserError(key, "has no value", f"give one with {key}=VALUE")
+    return {str(key): value for key, value in values.items()}
 
 
-def group_options(group: str) -> list[str]:
-    """Names that `group=NAME` takes."""
+def _store_groups(base: dict[str, Any], folder: Path | None) -> None:
+    """What Hydra composes from beside files: the schema with its recipe, and groups of what others have installed."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    store.store(name="schema", node=base)
+    for group, options in _installed_options().items():
+        for option in options - _file_options(group, folder):
+            store.store(group=group, name=option, node={group: option}, package="_global_")
+
+
+def _installed_options() -> dict[str, set[str]]:
+    """Methods and their recipes; those of a package that cannot be imported are left out until they are asked for."""
+    from popgen.methods.registry import METHODS
+
+    scales: set[str] = set()
+    for name in METHODS:
+        with suppress(UserError):
+            scales |= METHODS[name].recipes.keys()
+    return {"method": set(METHODS), "scale": scales}
+
+
+def group_options(group: str, config_dir: Path | None = None) -> list[str]:
+    """Names that `group=NAME` takes: files in conf/ and in a user's folder, and what is installed."""
+    return sorted(_file_options(group, config_dir) | _installed_options().get(group, set()))
+
+
+def _file_options(group: str, config_dir: Path | None) -> set[str]:
     from popgen.conf import DIRECTORY
 
-    folder = DIRECTORY / group
-    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
+    folders = [DIRECTORY / group, *([] if config_dir is None else [config_dir / group])]
+    return {
+        path.relative_to(folder).with_suffix("").as_posix() for folder in folders for path in folder.rglob("*.yaml")
+    }
+
+
+def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with nested `changes`."""
+    merged = dict(base)
+    for name, value in changes.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+        merged[name] = _merge(merged[name], value) if both else value
+    return merged
 
 
 def to_yaml(values: Mapping[str, Any]) -> str:
     """A configuration as YAML."""
     from omegaconf import OmegaConf
 
-    return OmegaConf.to_yaml(OmegaConf.create(values))
+    return OmegaConf.to_yaml(OmegaConf.create(dict(values)))
 
 
 def _translate(override: str) -> str:
@@ -83,16 +192,16 @@ def _unset(values: Any, prefix: str = "") -> list[str]:
     return [key for name, item in items for key in _unset(item, f"{prefix}.{name}" if prefix else str(name))]
 
 
-def _composition_error(error: Exception, overrides: Sequence[str]) -> UserError:
+def _composition_error(
+    error: Exception, overrides: Sequence[str], folder: Path | None, unknown: Callable[[str], UserError]
+) -> UserError:
     from hydra.errors import MissingConfigException, OverrideParseException
     from omegaconf.errors import InterpolationKeyError
-
-    from popgen.config.run_config import unknown_field
 
     text = str(error)
     if isinstance(error, MissingConfigException) and "Could not find" in text:
         group, _, option = text.partition("Could not find '")[2].partition("'")[0].partition("/")
-        return _unknown_option(group, option)
+        return _unknown_option(group, option, folder)
     if isinstance(error, OverrideParseException):
         return UserError(
             "overrides", f"cannot read {_culprit(text, overrides)!r}", "write KEY=VALUE, with quotes around odd text"
@@ -104,18 +213,19 @@ def _composition_error(error: Exception, overrides: Sequence[str]) -> UserError:
         )
     if text.startswith("Config group override"):  # a number or nothing where a name belongs
         groups = {override.partition("=")[0]: override.partition("=")[2] for override in overrides}
-        known = {group: group_options(group) for group in groups}
-        return next(_unknown_option(g, option) for g, option in groups.items() if known[g] and option not in known[g])
+        options = {group: group_options(group, folder) for group in groups}
+        wrong = (g for g, option in groups.items() if options[g] and option not in options[g])
+        return next(_unknown_option(group, groups[group], folder) for group in wrong)
     if text.startswith("Could not override '"):
-        return unknown_field(text.split("'")[1])
+        return unknown(text.split("'")[1])
     first = text.partition("\n")[0]
     if isinstance(error, InterpolationKeyError):
         return UserError(error.full_key or "overrides", first, "refer to a field that is there")
     return UserError("overrides", first, "see conf/ for what can be set")
 
 
-def _unknown_option(group: str, option: str) -> UserError:
-    options = group_options(group)
+def _unknown_option(group: str, option: str, folder: Path | None) -> UserError:
+    options = group_options(group, folder)
     by_leaf = {name.rpartition("/")[2]: name for name in options}
     close = difflib.get_close_matches(option, options, n=1) or [
         by_leaf[leaf] for leaf in difflib.get_close_matches(option.rpartition("/")[2], by_leaf, n=1)

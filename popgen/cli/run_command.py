@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
             return code
     preflight(config)
     if args.dry_run:
-        return _print_config(config.relevant(), args.json)
+        return _print_config(config.as_dict(), args.json)
     before_ray(config.cluster.threads, config.cluster.address is None)
     from popgen.pipelines.population import run_population
 

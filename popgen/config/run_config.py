@@ -5,10 +5,11 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-from collections.abc import Iterator
-from typing import Any, Literal
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any
 
-from pydantic import BaseModel, ValidationError, model_validator
+from pydantic import BaseModel, ValidationError
 
 from popgen.config.schema import Schema
 from popgen.config.sections import (
@@ -20,94 +21,59 @@ from popgen.config.sections import (
     TrackingConfig,
 )
 from popgen.errors import UserError
-from popgen.methods.mappo.config import DiversityConfig, PpoConfig
-from popgen.methods.xpm_sim.config import XpmSimConfig
-from popgen.methods.xpm_wm.config import (
-    OPEN_LOOP,
-    PREFILL_CHUNK,
-    AgentConfig,
-    Phase1Config,
-    Phase2Config,
-    ReplayConfig,
-    WorldModelConfig,
-)
 
-SECTIONS: dict[str, tuple[str, ...]] = {
-    "xpm_wm": ("world_model", "agent", "replay", "phase1", "phase2"),
-    "xpm_sim": ("xpm_sim",),
-    "mappo": ("ppo",),
-    "lipo": ("ppo", "diversity"),
-    "comedi": ("ppo", "diversity"),
-}
-"""Method -> its own sections of the config, beside those that all methods have."""
+_REGISTRY = "popgen.methods.registry"
+"""Module that knows each method's schema; imported by its name, since methods stand above this package."""
 
 
 class RunConfig(Schema):
-    """The whole of one run."""
+    """The sections that every run has; each method's own class adds its sections (`popgen/methods/*/config.py`)."""
 
-    method: Literal["xpm_wm", "xpm_sim", "mappo", "lipo", "comedi"] = "xpm_wm"
+    method: str
     scale: str = "laptop"
     env: EnvConfig = EnvConfig()
     population: PopulationConfig = PopulationConfig()
-    world_model: WorldModelConfig = WorldModelConfig()
-    agent: AgentConfig = AgentConfig()
-    replay: ReplayConfig = ReplayConfig()
-    phase1: Phase1Config = Phase1Config()
-    phase2: Phase2Config = Phase2Config()
-    xpm_sim: XpmSimConfig = XpmSimConfig()
-    ppo: PpoConfig = PpoConfig()
-    diversity: DiversityConfig = DiversityConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     cluster: ClusterConfig = ClusterConfig()
     tracking: TrackingConfig = TrackingConfig()
     run: RunSection = RunSection()
 
-    @model_validator(mode="after")
-    def _windows_fit(self) -> RunConfig:
-        """Every segment must hold a window of the reports, the caches some windows, the replays a segment."""
-        if self.method != "xpm_wm":
-            return self
-        phase, window = self.phase1, self.world_model.length + OPEN_LOOP
-        prefill = min(PREFILL_CHUNK, phase.prefill_steps // phase.envs)
-        if prefill < window:
-            problem = f"gives each environment {prefill} steps, a window of the reports is {window}"
-            raise UserError("phase1.prefill_steps", problem, f"make it at least {window * phase.envs}")
-        if phase.steps_per_iteration < window:
-            problem = f"is less than world_model.length + {OPEN_LOOP}, a window of the reports"
-            raise UserError("phase1.steps_per_iteration", problem, f"make it at least {window}")
-        segment = phase.envs * max(prefill, phase.steps_per_iteration)
-        if self.replay.capacity < segment:
-            problem = f"cannot hold the {segment:,} steps that phase1 adds at once"
-            raise UserError("replay.capacity", problem, "raise it or lower phase1.envs")
-        if self.phase2.cache < 4 * self.world_model.length:
-            raise UserError("phase2.cache", "is less than four times world_model.length", "raise it")
-        return self
-
     @classmethod
     def parse(cls, values: dict[str, Any]) -> RunConfig:
-        """Check a plain dictionary.
+        """Check a plain dictionary by the schema of the method that it names.
 
         Raises:
             UserError: for the first bad field, by its dotted name.
         """
+        schema = schema_of(values)
         try:
-            return cls.model_validate(values)
+            return schema.model_validate(values)
         except ValidationError as error:
-            raise as_user_error(error) from None
+            raise as_user_error(error, schema=schema) from None
 
-    def relevant(self) -> dict[str, Any]:
-        """The JSON-able config without the sections of other methods."""
-        others = {name for names in SECTIONS.values() for name in names} - set(SECTIONS[self.method])
-        return self.model_dump(mode="json", exclude=others)
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return self.model_dump(mode="json")
 
     def digest(self) -> str:
         """sha256 of everything that decides the result (not of where it runs or is tracked)."""
-        kept = {k: v for k, v in self.relevant().items() if k not in ("cluster", "tracking", "run")}
+        kept = {k: v for k, v in self.as_dict().items() if k not in ("cluster", "tracking", "run")}
         kept["seed"], kept["schedule"] = self.run.seed, self.run.schedule
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 
-def field_names(schema: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[str]:
+def schema_of(values: Mapping[str, Any]) -> type[RunConfig]:
+    """The schema of the method that a plain dictionary names, or of the default method.
+
+    Raises:
+        UserError: there is no such method.
+    """
+    registry = import_module(_REGISTRY)
+    name = values.get("method", registry.DEFAULT) if isinstance(values, Mapping) else registry.DEFAULT
+    return registry.find_method(name).config
+
+
+def field_names(schema: type[BaseModel], prefix: str = "") -> Iterator[str]:
     """Dotted names of all fields, sections included."""
     for name, info in schema.model_fields.items():
         yield prefix + name
@@ -115,9 +81,9 @@ def field_names(schema: type[BaseModel] = RunConfig, prefix: str = "") -> Iterat
             yield from field_names(info.annotation, f"{prefix}{name}.")
 
 
-def closest_field(key: str) -> str | None:
+def closest_field(key: str, schema: type[RunConfig]) -> str | None:
     """The field that a mistaken dotted key most likely means, by section, by last part, or by spelling."""
-    names = list(field_names())
+    names = list(field_names(schema))
     leaves = [name for name in names if not any(other.startswith(f"{name}.") for other in names)]
     section, _, last = key.rpartition(".")
     siblings = [name for name in leaves if name.rpartition(".")[0] == section]
@@ -130,14 +96,20 @@ def closest_field(key: str) -> str | None:
     return close[0] if close else None
 
 
-def unknown_field(key: str) -> UserError:
-    """The error for a key that no schema has."""
-    known = closest_field(key)
-    return UserError(key, "there is no such field", f"did you mean {known}?" if known else "see `popgen run --dry-run`")
+def unknown_field(key: str, schema: type[RunConfig]) -> UserError:
+    """The error for a key that the schema of the run's method does not have."""
+    meant = closest_field(key, schema)
+    fix = f"did you mean {meant}?" if meant else "see `popgen run --dry-run`"
+    owners = import_module(_REGISTRY).methods_with(key)
+    method = schema.model_fields["method"].default
+    if owners and method not in owners:
+        return UserError(key, f"is a setting of {' and '.join(owners)}, which {method} does not have", fix)
+    return UserError(key, "there is no such field", fix)
 
 
-def as_user_error(error: ValidationError, section: str = "") -> UserError:
-    """The first complaint of a schema in one line; `section` is the dotted name of where it stands."""
+def as_user_error(error: ValidationError, section: str = "", schema: type[RunConfig] | None = None) -> UserError:
+    """The first complaint of a schema in one line; `section` is the dotted name of where it stands, `schema` the whole
+    that names the field which an unknown one may mean."""
     first = error.errors()[0]
     parts = [section] * bool(section) + [str(part) for part in first["loc"]]
     cause = first.get("ctx", {}).get("error")
@@ -145,7 +117,7 @@ def as_user_error(error: ValidationError, section: str = "") -> UserError:
         return UserError(".".join([*parts, cause.field]), cause.problem, cause.fix)
     where = ".".join(parts) or "config"
     if first["type"] == "extra_forbidden":
-        return unknown_field(where)
+        return UserError(where, "there is no such field") if schema is None else unknown_field(where, schema)
     got = first.get("input")
     shown = "" if isinstance(got, BaseModel | dict) else f" (got {got!r})"
     fix = "give it a value" if first["type"] == "missing" else "correct the value"

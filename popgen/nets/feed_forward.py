@@ -71,9 +71,9 @@ class FeedForwardNet(nn.Sequential):
         super().__init__(*convolutions, *hidden, nn.Linear(inputs, outputs))
         self.shape = (*view.shape[:-1], view.shape[-1] * copies)
         self.grid, self.first = grid, len(convolutions)
-        largest = torch.tensor(view.maxima * copies if view.maxima else (view.scale,), dtype=torch.float32)
-        self.register_buffer("largest", largest, persistent=False)
-        self.scaled = bool((largest != 1.0).any())
+        maxima = view.maxima * copies if view.maxima else (view.scale,)
+        self.register_buffer("largest", torch.tensor(maxima, dtype=torch.float32), persistent=False)
+        self.scaled = any(largest != 1.0 for largest in maxima)
 
     def forward(self, obs: Tensor, extras: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         """obs (R, *shape) of any dtype, extras (R, X) -> (R, outputs)."""

@@ -12,14 +12,21 @@ from popgen.envs.contract import EnvSpec
 from popgen.play.policy import Policy
 
 POLICIES: dict[str, str] = {
-    "world_model": "popgen.methods.xpm_wm.acting:WorldModelPolicy",
     "random": "popgen.policies.simple_policies:RandomPolicy",
     "idle": "popgen.policies.simple_policies:IdlePolicy",
     "feed_forward": "popgen.policies.feed_forward_policy:FeedForwardPolicy",
-    "encoded": "popgen.methods.xpm_sim.encoded_policy:EncodedPolicy",
     "human_clone": "popgen.humans.clone_policy:ClonePolicy",
 }
-"""kind -> `module:class`; the only classes that a loaded artefact can name."""
+"""kind -> `module:class` of policies of no method in particular."""
+
+_METHODS = "popgen.methods.registry"
+"""Module that knows the kinds of methods' policies; imported by its name, since methods stand above this package."""
+
+
+def policy_kinds() -> dict[str, str]:
+    """kind -> `module:class` of all policies, those of installed methods too: the only classes that a loaded artefact
+    can name."""
+    return POLICIES | import_module(_METHODS).policy_kinds()
 
 
 def policy_class(kind: str) -> type[Policy]:
@@ -28,9 +35,10 @@ def policy_class(kind: str) -> type[Policy]:
     Raises:
         ValueError: the kind is not registered.
     """
-    if kind not in POLICIES:
-        raise ValueError(f"unknown policy kind {kind!r}, known are {', '.join(sorted(POLICIES))}")
-    module, _, name = POLICIES[kind].partition(":")
+    places = POLICIES if kind in POLICIES else policy_kinds()
+    if kind not in places:
+        raise ValueError(f"unknown policy kind {kind!r}, known are {', '.join(sorted(places))}")
+    module, _, name = places[kind].partition(":")
     return getattr(import_module(module), name)
 
 

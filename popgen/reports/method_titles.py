@@ -2,27 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from popgen.methods.registry import METHODS
 
-
-@dataclass(frozen=True)
-class _Interim:
-    name: str
-    title: str
-    colour: str
-    marker: str
-
-
-METHODS = {
-    m.name: m
-    for m in (
-        _Interim("xpm_wm", "XPM-WM", "#0072B2", "o"),
-        _Interim("xpm_sim", "XPM-Sim", "#009E73", "D"),
-        _Interim("lipo", "LIPO", "#E69F00", "s"),
-        _Interim("comedi", "CoMeDi", "#CC79A7", "^"),
-        _Interim("mappo", "MAPPO", "#D55E00", "v"),
-    )
-}
+__all__ = ["METHODS", "name_of", "title_of"]
 
 
 def title_of(label: str) -> str:

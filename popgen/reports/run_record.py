@@ -132,7 +132,7 @@ def planned_run(config: RunConfig, label: str | None = None) -> RunRecord:
         seed=config.run.seed,
         scale=config.scale,
         environment=EnvironmentInfo.of(spec),
-        settings=_decisive_settings(config.relevant()),
+        settings=_decisive_settings(config.as_dict()),
         members=(),
         evaluation_steps=0,
         lost_steps=0,
@@ -182,7 +182,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise UserError(str(file), f"cannot be read ({error})", fix) from None
     try:
-        return RunConfig.parse(values).relevant()  # with the defaults of fields that are younger than the run
+        return RunConfig.parse(values).as_dict()  # with the defaults of fields that are younger than the run
     except (UserError, TypeError):
         pass  # of a version with other fields: what is needed is the same in all of them
     sections = ("population", "run", "env")

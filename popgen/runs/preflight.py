@@ -1,4 +1,4 @@
-"""What must hold before anything starts: checked in a second or two, without Ray, torch or MLflow."""
+"""What must hold before anything starts: checked in a second or two, without Ray or MLflow."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from popgen.config.run_config import SECTIONS, RunConfig
+from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
-from popgen.methods.xpm_wm.config import OPEN_LOOP, SHAPES
+from popgen.methods.method import Continuation, Method, Needs
+from popgen.methods.registry import METHODS
 from popgen.runs import sizes
 from popgen.runs.mlflow_tracker import check_uri
 from popgen.runs.resources import demands, total
@@ -27,9 +28,6 @@ CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_b
 
 MOST_EPISODES = 1_000_000
 """Of an evaluation."""
-
-_CAPACITY = {"xpm_wm": "replay.capacity", "xpm_sim": "xpm_sim.capacity"}
-_BATCH = {"xpm_wm": "agent.horizon", "xpm_sim": "xpm_sim.unroll"}
 
 _RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -45,35 +43,20 @@ def preflight(config: RunConfig) -> None:
     spec = _build(config)
     check_run_id(config.run.id)
     check_cluster(config)
-    if config.method == "xpm_wm":
-        _check_view(config, spec)
-        _check_rewards(config, spec)
-        _check_lengths(config, spec)
-    if "ppo" in SECTIONS[config.method]:
-        check_baseline(config, spec)
-    if config.method == "xpm_sim":
-        _check_simulation(config, spec)
+    method = METHODS[config.method]
+    method.check(config, spec)
     if config.tracking.enabled:
         check_uri(config.tracking.uri)
     if config.population.init_from is not None:
-        _check_start(config, spec)
-    check_memory(config, spec)
-    if config.method in _CAPACITY:
-        check_store(config, spec)
+        _check_start(config, spec, method)
+    needs = method.needs(config, spec)
+    check_memory(config, needs)
+    check_store(config, needs)
     check_evaluation(config)
     check_kept(Path(config.run.root))
-    check_root(Path(config.run.root), sizes.disk_bytes(config, spec))
+    check_root(Path(config.run.root), sizes.disk_bytes(config, needs))
     if config.run.storage is not None:
-        check_storage(config, spec)
-
-
-def check_baseline(config: RunConfig, spec: EnvSpec) -> None:
-    """What RLlib's MAPPO needs: the view and CoMeDi's order."""
-    ppo = config.ppo
-    if ppo.view not in spec.views:
-        raise UserError("ppo.view", f"{spec.name} has no view {ppo.view!r}", f"choose one of {', '.join(spec.views)}")
-    if config.method == "comedi" and config.diversity.order != "sequential":
-        raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")
+        check_storage(config, needs)
 
 
 def check_evaluation(config: RunConfig) -> None:
@@ -93,7 +76,7 @@ def check_kept(root: Path) -> None:
         raise UserError("run.root", problem, "give an absolute path on storage that stays, shared by all nodes")
 
 
-def check_storage(config: RunConfig, spec: EnvSpec) -> None:
+def check_storage(config: RunConfig, needs: Needs) -> None:
     """A storage that can be opened and, where it is a folder of this machine, written to, with room for the copy."""
     from popgen.runs.storage import local_folder, open_storage
 
@@ -103,9 +86,9 @@ def check_storage(config: RunConfig, spec: EnvSpec) -> None:
     folder = local_folder(*open_storage(uri))
     if folder is None:
         return
-    needed, root = sizes.copy_bytes(config, spec), Path(config.run.root)
+    needed, root = sizes.copy_bytes(config, needs), Path(config.run.root)
     if _device(folder) == _device(root):
-        needed += sizes.disk_bytes(config, spec)
+        needed += sizes.disk_bytes(config, needs)
     check_root(folder, needed, "run.storage")
 
 
@@ -118,36 +101,37 @@ def check_run_id(name: str | None) -> None:
         )
 
 
-def check_memory(config: RunConfig, spec: EnvSpec) -> None:
-    """Buffers, object store and a batch must fit into this machine's memory; a cluster's nodes are not looked at, but
-    the baselines learn in the driver's process."""
-    if config.cluster.address is not None and "ppo" not in SECTIONS[config.method]:
+def check_memory(config: RunConfig, needs: Needs) -> None:
+    """Buffers, object store and a batch must fit into this machine's memory. A cluster's nodes are not looked at, but
+    some methods learn in the driver's process."""
+    if config.cluster.address is not None and not needs.in_driver:
         return
-    needed, have = sizes.memory_needed(config, spec), memory_bytes()
+    needed, have = sizes.memory_needed(config, needs), memory_bytes()
     if needed <= have:
         return
-    batch, store = sizes.batch_bytes(config, spec), config.cluster.object_store_bytes or 0
     parts = {
-        _CAPACITY.get(config.method, ""): 4 * sizes.buffer_bytes(config, spec),
-        _BATCH.get(config.method, "ppo.envs"): batch,
-        "cluster.object_store_bytes": store,
+        needs.buffers_field: 4 * needs.buffers,
+        needs.batch_field: needs.batch,
+        "cluster.object_store_bytes": config.cluster.object_store_bytes or 0,
     }
     field = max(parts, key=lambda name: parts[name])
-    told = f"buffers of {_gib(sizes.buffer_bytes(config, spec))} and batches of {_gib(batch)}"
-    problem = f"{told}, with their copies and the object store, need about {_gib(needed)}, this machine has"
+    what = f"buffers of {_gib(needs.buffers)} and batches of {_gib(needs.batch)}"
+    problem = f"{what}, with their copies and the object store, need about {_gib(needed)}, this machine has"
     raise UserError(field, f"{problem} {_gib(have)}", "lower it")
 
 
-def check_store(config: RunConfig, spec: EnvSpec) -> None:
-    """The object store, given or Ray's own choice here, must hold what is in it at a time."""
-    given, needed = config.cluster.object_store_bytes, sizes.store_bytes(config, spec)
-    if given is not None and given < needed:
-        problem = f"{given:,} bytes, but {needed:,} may be in it at a time"
-        raise UserError("cluster.object_store_bytes", problem, f"raise it or lower {_CAPACITY[config.method]}")
+def check_store(config: RunConfig, needs: Needs) -> None:
+    """The object store, of the given size or Ray's own choice here, must hold what is in it at a time."""
+    if not needs.buffers:
+        return
+    size, needed = config.cluster.object_store_bytes, sizes.store_bytes(needs)
+    if size is not None and size < needed:
+        problem = f"{size:,} bytes, but {needed:,} may be in it at a time"
+        raise UserError("cluster.object_store_bytes", problem, f"raise it or lower {needs.buffers_field}")
     chosen = int(RAYS_SHARE * memory_bytes())
-    if given is None and config.cluster.address is None and chosen < needed:
+    if size is None and config.cluster.address is None and chosen < needed:
         problem = f"Ray's own choice is {_gib(chosen)}, but {_gib(needed)} may be in it at a time"
-        raise UserError("cluster.object_store_bytes", problem, f"set it, or lower {_CAPACITY[config.method]}")
+        raise UserError("cluster.object_store_bytes", problem, f"set it, or lower {needs.buffers_field}")
 
 
 def check_cluster(config: RunConfig) -> None:
@@ -218,43 +202,9 @@ def _build(config: RunConfig) -> EnvSpec:
         raise UserError(field, error.problem, error.fix) from None
 
 
-def _check_view(config: RunConfig, spec: EnvSpec) -> None:
-    view = config.world_model.view
-    if view not in spec.views:
-        raise UserError(
-            "world_model.view", f"{spec.name} has no view {view!r}", f"choose one of {', '.join(spec.views)}"
-        )
-
-
-def _check_rewards(config: RunConfig, spec: EnvSpec) -> None:
-    """The imagined reward is made of events alone."""
-    if not any(spec.event_weights):
-        problem = f"{config.method} needs an environment with weighted events, {spec.name} has none"
-        raise UserError("env.name", problem, "choose another environment")
-
-
-def _check_lengths(config: RunConfig, spec: EnvSpec) -> None:
-    window, phase = config.world_model.length + OPEN_LOOP, config.phase2
-    if window > spec.horizon:
-        problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
-        raise UserError("world_model.length", f"{problem} ({spec.horizon})", "shorten them")
-    added = max(phase.episodes_sp, phase.episodes_xp) * (spec.horizon + 1)
-    if config.replay.capacity < added:
-        problem = f"cannot hold the {added:,} steps that phase2 adds at once"
-        raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
-
-
-def _check_simulation(config: RunConfig, spec: EnvSpec) -> None:
-    """A round's real episodes must fit the buffers; where episodes end early each step can add a second row."""
-    given = config.xpm_sim
-    added = 2 * max(given.episodes_sp, given.episodes_xp) * spec.horizon
-    if given.capacity < added:
-        problem = f"may not hold the {added:,} rows that a round of real episodes adds"
-        raise UserError("xpm_sim.capacity", problem, "raise it or lower xpm_sim.episodes_sp and episodes_xp")
-
-
-def _check_start(config: RunConfig, spec: EnvSpec) -> None:
-    if config.method != "xpm_wm":
+def _check_start(config: RunConfig, spec: EnvSpec, method: Method) -> None:
+    """A population to continue must be there, of this environment and method, with a checkpoint, and smaller."""
+    if method.continuation is None:
         raise UserError("population.init_from", f"{config.method} has no use for it", "leave it out")
     from popgen.population import check_compatible, load_population
 
@@ -270,38 +220,39 @@ def _check_start(config: RunConfig, spec: EnvSpec) -> None:
         problem = f"{config.population.size} leaves nothing to train after {wanted} members of {run}"
         raise UserError("population.size", problem, "raise it above population.init_members")
     first = population.info(1)
-    if first.kind != "world_model":
+    if first.kind != method.continuation.kind:
         raise UserError(
             "population.init_from", f"{run} has members of kind {first.kind}", "choose a run of this method"
         )
-    _check_sizes(config, run)
+    _check_shapes(config, run, method.continuation)
     if not (run / "checkpoints" / f"member_{wanted:03d}").is_dir():
         problem = f"{run} has no checkpoint of member {wanted}"
         raise UserError("population.init_members", problem, "choose a member that has one")
 
 
-def _check_sizes(config: RunConfig, run: Path) -> None:
+def _check_shapes(config: RunConfig, run: Path, continuation: Continuation) -> None:
     """The origin's networks must have our sizes; its config.json may be of another version in all else."""
     path = run / "config.json"
     try:
-        known = json.loads(path.read_text(encoding="utf-8"))
+        origin = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         problem = f"cannot read {path} ({getattr(error, 'strerror', None) or 'it is no JSON'})"
         raise UserError("population.init_from", problem, "give a run's folder") from None
-    ours = config.model_dump(mode="json")
-    for section, names in SHAPES.items():
-        part = known.get(section) if isinstance(known, dict) else None
+    ours = config.as_dict()
+    for section, names in continuation.shapes.items():
+        part = origin.get(section) if isinstance(origin, dict) else None
         if not isinstance(part, dict):
             raise UserError("population.init_from", f"{path} has no {section!r}", "give a run's folder")
         for name in names:
             there, here = part.get(name), ours[section][name]
             if there != here:
                 raise UserError(f"{section}.{name}", f"is {here!r}, but {there!r} in {run}", "use the same sizes")
-    replay = known.get("replay")
-    held = replay.get("capacity") if isinstance(replay, dict) else None
-    if isinstance(held, int) and config.replay.capacity < held:
-        problem = f"is {config.replay.capacity:,}, but the buffers of {run} may hold {held:,} steps"
-        raise UserError("replay.capacity", problem, "raise it")
+    section, name = continuation.capacity
+    replay = origin.get(section)
+    held = replay.get(name) if isinstance(replay, dict) else None
+    if isinstance(held, int) and ours[section][name] < held:
+        problem = f"is {ours[section][name]:,}, but the buffers of {run} may hold {held:,} steps"
+        raise UserError(f"{section}.{name}", problem, "raise it")
 
 
 def _gib(size: int) -> str:

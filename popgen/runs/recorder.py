@@ -246,7 +246,7 @@ def _check_same_config(folder: Path, config: RunConfig) -> None:
             raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
         if previous.digest() != config.digest():
             raise UserError("run.id", f"{folder.name} exists with another config", "choose another id")
-    replace_file(path, json.dumps(config.relevant(), indent=1).encode())
+    replace_file(path, json.dumps(config.as_dict(), indent=1).encode())
 
 
 def _count_attempt(folder: Path) -> int:

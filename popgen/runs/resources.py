@@ -5,42 +5,21 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
-from popgen.config.run_config import SECTIONS, RunConfig
+from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.methods.method import ActorDemand
+from popgen.methods.registry import METHODS
 
 ROUNDING = 1e-9
 
 
-@dataclass(frozen=True)
-class Demand:
-    """`count` actors that take `amounts` of one node's resources each, which the config's `field` says."""
-
-    field: str
-    count: int
-    amounts: dict[str, float]
+def demands(config: RunConfig) -> list[ActorDemand]:
+    """What the actors of the run's method ask Ray for."""
+    return METHODS[config.method].actors(config)
 
 
-def demands(config: RunConfig) -> list[Demand]:
-    """What the method's actors ask Ray for. XPM-Sim's learner steps the simulator and stays on processors; the
-    baselines' learner is in the driver's process."""
-    cluster = config.cluster
-
-    def ask(field: str, count: int, gpus: float = 0.0) -> Demand:
-        amounts = {"CPU": getattr(cluster, field), "GPU": gpus, **cluster.resources}
-        return Demand(f"cluster.{field}", count, {name: amount for name, amount in amounts.items() if amount})
-
-    if "ppo" in SECTIONS[config.method]:
-        return [ask("sampler_cpus", config.ppo.runners)]
-    samplers = ask("sampler_cpus", cluster.samplers)
-    if config.method == "xpm_sim":
-        return [samplers, ask("agent_cpus", 1)]
-    model, agent = ask("model_cpus", 1, cluster.model_gpus), ask("agent_cpus", 1, cluster.agent_gpus)
-    return [samplers, ask("replay_cpus", 2), model, agent]
-
-
-def total(wanted: Sequence[Demand]) -> dict[str, float]:
+def total(wanted: Sequence[ActorDemand]) -> dict[str, float]:
     """What all of them ask for together."""
     amounts: Counter[str] = Counter()
     for demand in wanted:
@@ -48,7 +27,7 @@ def total(wanted: Sequence[Demand]) -> dict[str, float]:
     return dict(amounts)
 
 
-def check_room(wanted: Sequence[Demand], nodes: Sequence[Mapping[str, float]]) -> None:
+def check_room(wanted: Sequence[ActorDemand], nodes: Sequence[Mapping[str, float]]) -> None:
     """The actors must find room on the nodes, whose resources are given by name, or they wait for ever.
 
     Raises:

@@ -9,6 +9,7 @@ from popgen.cli.compose import compose, group_options
 from popgen.config.run_config import RunConfig, closest_field
 from popgen.envs import env_names, make_env
 from popgen.errors import UserError
+from popgen.methods.xpm_wm.config import XpmWmRun
 
 LAYOUTS = [name for name in env_names() if name.startswith("overcooked/")]
 
@@ -24,7 +25,7 @@ def nested(name: str, value: Any) -> dict[str, Any]:
 
 
 def test_defaults_are_the_laptop_preset() -> None:
-    default = RunConfig().model_dump()
+    default = XpmWmRun().model_dump()
     default["env"] = parsed().env.model_dump()
     assert parsed().model_dump() == default
     assert parsed("scale=laptop") == parsed()
@@ -119,7 +120,7 @@ def numeric_fields() -> list[str]:
             elif isinstance(value, int | float) and not isinstance(value, bool):
                 found.append(prefix + name)
 
-    walk(RunConfig().model_dump(), "")
+    walk(XpmWmRun().model_dump(), "")
     return found
 
 
@@ -204,7 +205,7 @@ def test_the_replays_must_hold_what_is_added_at_once() -> None:
     ],
 )
 def test_a_mistaken_key_finds_the_one_meant(mistake: str, meant: str | None) -> None:
-    assert closest_field(mistake) == meant
+    assert closest_field(mistake, XpmWmRun) == meant
 
 
 def test_parse_names_the_unknown_field_and_the_one_meant() -> None:

@@ -17,6 +17,7 @@ from conftest import ROOT
 from popgen import cli
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.pipelines.population import run_population
 from popgen.progress import NullReporter
 from popgen.runs import directory as runs
@@ -36,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
     """A run of three members of which one is there, with 30 random and 12 self-play steps."""
     path = tmp_path / "runs" / "first"
     (path / "population").mkdir(parents=True)
-    values = RunConfig().relevant()
+    values = XpmWmRun().as_dict()
     values["population"]["size"] = 3
     (path / "config.json").write_text(json.dumps(values))
     (path / "population" / "manifest.json").write_text(json.dumps({"members": [{"id": 1}]}))
@@ -172,7 +173,7 @@ def test_a_damaged_run_is_named_and_hides_no_other(folder: Path, name: str, cont
     (folder / name).write_bytes(content)
     other = folder.parent / "second"
     other.mkdir()
-    (other / "config.json").write_text(json.dumps(RunConfig().relevant()))
+    (other / "config.json").write_text(json.dumps(XpmWmRun().as_dict()))
     (folder.parent / "no_run").mkdir()
     found = {run["id"]: run for run in list_runs(folder.parent)}
     assert found.keys() == {"first", "second"}

@@ -28,7 +28,8 @@ def configured(root: Path, *overrides: str) -> RunConfig:
 def needed(config: RunConfig) -> tuple[int, int]:
     """The folder's bytes and its copy's."""
     spec = make_env(config.env.name, 1, **config.env.params).spec
-    return sizes.disk_bytes(config, spec), sizes.copy_bytes(config, spec)
+    needs = sizes.needs_of(config, spec)
+    return sizes.disk_bytes(config, needs), sizes.copy_bytes(config, needs)
 
 
 def refusal(config: RunConfig) -> UserError:
@@ -126,7 +127,7 @@ def test_what_the_memory_cannot_hold_is_refused(overrides: list[str], field: str
 def test_an_object_store_of_rays_choice_must_be_large_enough(tmp_path: Path, memory: Any) -> None:
     config = configured(tmp_path, "replay.capacity=1000000")
     spec = make_env(config.env.name, 1, **config.env.params).spec
-    enough = sizes.store_bytes(config, spec)
+    enough = sizes.store_bytes(sizes.needs_of(config, spec))
     memory(int(enough / module.RAYS_SHARE) - 2**20)
     told = refusal(config)
     assert (told.field, told.fix) == ("cluster.object_store_bytes", "set it, or lower replay.capacity")

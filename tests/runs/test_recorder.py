@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from popgen.config.run_config import RunConfig
 from popgen.config.sections import RunSection, TrackingConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.reports.training_curves import Point, read_curves
 from popgen.runs.mlflow_tracker import Tracker
@@ -23,7 +23,7 @@ SPEC = make_env("overcooked/cramped_room").spec
 
 
 def recorder(root: Path, **agent: Any) -> RunRecorder:
-    config = RunConfig(run=RunSection(root=str(root), id="r"), tracking=TrackingConfig(enabled=False))
+    config = XpmWmRun(run=RunSection(root=str(root), id="r"), tracking=TrackingConfig(enabled=False))
     return RunRecorder(config.model_copy(update={"agent": config.agent.model_copy(update=agent)}), SPEC)
 
 
@@ -80,7 +80,7 @@ def test_half_a_point_is_dropped_and_repeated_points_count_once(tmp_path: Path) 
 
 
 def test_artefacts_of_a_run_that_goes_on_are_there_once_and_the_latest(tmp_path: Path) -> None:
-    config = RunConfig(run=RunSection(root=str(tmp_path), id="r"))
+    config = XpmWmRun(run=RunSection(root=str(tmp_path), id="r"))
     report = tmp_path / "matrix.csv"
     state = None
     for attempt in (1, 2):

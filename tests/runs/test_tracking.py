@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from popgen.config.run_config import RunConfig
 from popgen.config.sections import TrackingConfig
 from popgen.errors import UserError
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker, check_uri
 
 
@@ -32,7 +32,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     folder = tmp_path_factory.mktemp("run")
     (folder / "report").mkdir()
     (folder / "report" / "matrix.json").write_text("{}")
-    first = Tracker(TrackingConfig(), folder, "run-1", RunConfig().model_dump(mode="json"))
+    first = Tracker(TrackingConfig(), folder, "run-1", XpmWmRun().model_dump(mode="json"))
     for step in range(1250):
         first.log({"loss": step / 2, "score": 1.0}, step=step, member=1)
     first.log_scaling(1, 600_000)
@@ -40,7 +40,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     first.log_artifact(folder / "report" / "matrix.json", member=1)
     first.flush()
     state = json.loads(json.dumps(first.state()))
-    second = Tracker(TrackingConfig(), folder, "run-1", RunConfig().model_dump(mode="json"), resume=state)
+    second = Tracker(TrackingConfig(), folder, "run-1", XpmWmRun().model_dump(mode="json"), resume=state)
     second.log({"loss": 9.0}, step=1250, member=1)
     second.log({"loss": math.nan}, step=0, member=2)
     second.log_scaling(2, 660_000)
@@ -62,8 +62,8 @@ def test_members_are_nested_in_the_parent(tracked: Tracker) -> None:
     assert all(run.data.tags["mlflow.parentRunId"] == parent.info.run_id for run in runs.values())
     assert all(run.info.status == "FINISHED" for run in runs.values())
     assert (
-        parent.data.params["agent.lambda_xp"] == str(RunConfig().agent.lambda_xp)
-        and parent.data.params["env.name"] == RunConfig().env.name
+        parent.data.params["agent.lambda_xp"] == str(XpmWmRun().agent.lambda_xp)
+        and parent.data.params["env.name"] == XpmWmRun().env.name
     )
 
 

@@ -57,7 +57,7 @@ def finished_run(
     spec = make_env(config.env.name, 1, **config.env.params).spec
     identity = {"method": method, "config_digest": config.digest(), "seed": seed}
     writer = PopulationWriter(folder / "population", spec, **identity, resume=True)
-    (folder / "config.json").write_text(json.dumps(config.relevant()))
+    (folder / "config.json").write_text(json.dumps(config.as_dict()))
     (folder / "attempts.txt").write_text("2026-01-01\n")
     ledger = Ledger(folder / "ledger.jsonl")
     for member, (taken, time) in enumerate(zip(steps, seconds or [60.0] * len(steps), strict=True), start=1):

@@ -10,8 +10,8 @@ on it counts. A member that plays badly only to look different in cross-play wou
 
 from __future__ import annotations
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
+from popgen.methods.mappo.config import ComediRun
 from popgen.methods.mappo.objective import Objective, Term
 from popgen.methods.mappo.train import RllibTraining, open_rllib
 from popgen.methods.transport import Transport
@@ -23,6 +23,6 @@ MIXED_PLAY = Term(Kind.MP, weight=lambda recipe: recipe.lambda_mp)
 OBJECTIVE = Objective(terms=(MIXED_PLAY, CROSS_PLAY), fresh_episodes=True)
 
 
-def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
+def open_training(config: ComediRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
     """See `popgen.methods.transport.OpenTraining`."""
     return open_rllib(config, spec, attempt, transport, OBJECTIVE)

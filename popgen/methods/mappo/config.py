@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from popgen.config.run_config import RunConfig
 from popgen.config.schema import Batch, Fraction, Layers, NonNegative, Positive, Rate, Schema, Weight, Width, _Int
 from popgen.errors import UserError
 
@@ -93,3 +94,33 @@ class DiversityConfig(Schema):
     select_every: Positive = 5
     select_episodes: Batch = 2
     target_xp: Weight = 2.0
+
+
+class BaselineRun(RunConfig):
+    """What the runs of all baselines have."""
+
+    ppo: PpoConfig = PpoConfig()
+
+
+class MappoRun(BaselineRun):
+    """A run of MAPPO: self-play alone."""
+
+    method: Literal["mappo"] = "mappo"
+
+
+class PartnerRun(BaselineRun):
+    """What the runs of baselines that meet partners have."""
+
+    diversity: DiversityConfig = DiversityConfig()
+
+
+class LipoRun(PartnerRun):
+    """A run of LIPO."""
+
+    method: Literal["lipo"] = "lipo"
+
+
+class ComediRun(PartnerRun):
+    """A run of CoMeDi."""
+
+    method: Literal["comedi"] = "comedi"

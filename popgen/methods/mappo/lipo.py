@@ -9,8 +9,8 @@ All members learn together, each the others' partner; with `diversity.order=sequ
 
 from __future__ import annotations
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
+from popgen.methods.mappo.config import LipoRun
 from popgen.methods.mappo.objective import Objective, Term
 from popgen.methods.mappo.train import RllibTraining, open_rllib
 from popgen.methods.transport import Transport
@@ -21,6 +21,6 @@ CROSS_PLAY = Term(Kind.XP, weight=lambda recipe: recipe.lambda_xp)
 OBJECTIVE = Objective(terms=(CROSS_PLAY,), fresh_episodes=False)
 
 
-def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
+def open_training(config: LipoRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
     """See `popgen.methods.transport.OpenTraining`."""
     return open_rllib(config, spec, attempt, transport, OBJECTIVE)

@@ -17,11 +17,11 @@ from dataclasses import asdict, dataclass, field
 
 import torch
 
-from popgen.config.run_config import RunConfig
 from popgen.config.sections import ClusterConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.mappo.algorithm import Mappo, build_algorithm
+from popgen.methods.mappo.config import BaselineRun, DiversityConfig, PartnerRun
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.training_job import Job, policy_config
 from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
@@ -55,25 +55,31 @@ class GroupProgress:
         return GroupProgress(int(state["sequence"]), float(state["seconds"]), steps)
 
 
-def learning_members(objective: Objective, config: RunConfig, first: int) -> tuple[int, ...]:
+def partner_settings(objective: Objective, config: BaselineRun) -> DiversityConfig | None:
+    """Those of a run that meets partners; None for self-play alone."""
+    return config.diversity if objective.meets_partners and isinstance(config, PartnerRun) else None
+
+
+def learning_members(objective: Objective, config: BaselineRun, first: int) -> tuple[int, ...]:
     """The members that learn together with `first`."""
-    together = objective.meets_partners and config.diversity.order == "concurrent"
+    diversity = partner_settings(objective, config)
+    together = diversity is not None and diversity.order == "concurrent"
     return tuple(range(1, config.population.size + 1)) if together else (first,)
 
 
 def training_job(
-    objective: Objective, config: RunConfig, learning: tuple[int, ...], archive: Mapping[int, Weights]
+    objective: Objective, config: BaselineRun, learning: tuple[int, ...], archive: Mapping[int, Weights]
 ) -> Job:
     """What RLlib is to train; `archive` holds the weights of the members that are finished."""
-    meets, first = objective.meets_partners, learning[0]
+    diversity, first = partner_settings(objective, config), learning[0]
     return Job(
         env=config.env,
         ppo=config.ppo,
-        diversity=config.diversity if meets else None,
+        diversity=diversity,
         learning=learning,
         seed=config.run.seed * 1000 + first,
-        frozen={member: archive[member] for member in range(1, first)} if meets else {},
-        mixed=objective.samples(Kind.MP, config.diversity),
+        frozen={member: archive[member] for member in range(1, first)} if diversity else {},
+        mixed=diversity is not None and objective.samples(Kind.MP, diversity),
         fresh=objective.fresh_episodes,
     )
 
@@ -96,7 +102,7 @@ class RllibTraining:
     log_rows = 1  # no log: there are no buffers
     begins_workers = True  # RLlib starts its runners with every group of members
 
-    def __init__(self, config: RunConfig, spec: EnvSpec, attempt: str, objective: Objective) -> None:
+    def __init__(self, config: BaselineRun, spec: EnvSpec, attempt: str, objective: Objective) -> None:
         self.config, self.spec, self.attempt, self.objective = config, spec, attempt, objective
         self.archive: dict[int, Weights] = {}
         self.learning: tuple[int, ...] = ()
@@ -237,7 +243,7 @@ class RllibTraining:
 
 
 def open_rllib(
-    config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport, objective: Objective
+    config: BaselineRun, spec: EnvSpec, attempt: str, transport: Transport, objective: Objective
 ) -> RllibTraining:
     """The training of an objective; RLlib starts its own workers.
 
@@ -249,6 +255,6 @@ def open_rllib(
     return RllibTraining(config, spec, attempt, objective)
 
 
-def open_training(config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
+def open_training(config: BaselineRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
     """MAPPO alone: members differ by their seeds. See `popgen.methods.transport.OpenTraining`."""
     return open_rllib(config, spec, attempt, transport, SELF_PLAY)

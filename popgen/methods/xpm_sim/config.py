@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
     Fraction,
@@ -105,3 +106,10 @@ class XpmSimConfig(Schema):
         if self.minibatches > self.sims_sp * self.unroll:
             raise UserError("minibatches", "exceeds the samples of a batch", "lower it")
         return self
+
+
+class XpmSimRun(RunConfig):
+    """A run of XPM-Sim."""
+
+    method: Literal["xpm_sim"] = "xpm_sim"
+    xpm_sim: XpmSimConfig = XpmSimConfig()

@@ -16,7 +16,6 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, replace
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.envs.reward import rewards_events
 from popgen.methods.training import (
@@ -33,6 +32,7 @@ from popgen.methods.training import (
     TrainedMember,
 )
 from popgen.methods.xpm_sim.agent import make_actor
+from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.round_rules import MemberProgress, round_matches, score_round, seatings, updates_of_round
 from popgen.methods.xpm_sim.workers import Learned, Workers
 from popgen.nets.weights import Weights, prefixed
@@ -48,7 +48,7 @@ class XpmSimTraining:
     log_rows = 1  # no log: the learner's state holds its buffers
     begins_workers = False
 
-    def __init__(self, config: RunConfig, spec: EnvSpec, attempt: str, workers: Workers) -> None:
+    def __init__(self, config: XpmSimRun, spec: EnvSpec, attempt: str, workers: Workers) -> None:
         self.run, self.config, self.spec, self.workers = config.run, config.xpm_sim, spec, workers
         self.attempt = attempt.rpartition(".")[2]
         self.policy = make_actor(self.config, spec)

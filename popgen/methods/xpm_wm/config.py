@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, model_validator
 
+from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
     Fraction,
@@ -216,4 +217,34 @@ class Phase2Config(Schema):
     def _shares_of_starts(self) -> Phase2Config:
         if self.starts_random + self.starts_event > 1.0 + 1e-9:
             raise UserError("starts_random", "exceeds 1 together with starts_event", "lower one of them")
+        return self
+
+
+class XpmWmRun(RunConfig):
+    """A run of XPM-WM."""
+
+    method: Literal["xpm_wm"] = "xpm_wm"
+    world_model: WorldModelConfig = WorldModelConfig()
+    agent: AgentConfig = AgentConfig()
+    replay: ReplayConfig = ReplayConfig()
+    phase1: Phase1Config = Phase1Config()
+    phase2: Phase2Config = Phase2Config()
+
+    @model_validator(mode="after")
+    def _check_windows(self) -> XpmWmRun:
+        """Every segment must hold a window of the reports, the caches some windows, the replays a segment."""
+        phase, window = self.phase1, self.world_model.length + OPEN_LOOP
+        prefill = min(PREFILL_CHUNK, phase.prefill_steps // phase.envs)
+        if prefill < window:
+            problem = f"gives each environment {prefill} steps, a window of the reports is {window}"
+            raise UserError("phase1.prefill_steps", problem, f"make it at least {window * phase.envs}")
+        if phase.steps_per_iteration < window:
+            problem = f"is less than world_model.length + {OPEN_LOOP}, a window of the reports"
+            raise UserError("phase1.steps_per_iteration", problem, f"make it at least {window}")
+        segment = phase.envs * max(prefill, phase.steps_per_iteration)
+        if self.replay.capacity < segment:
+            problem = f"cannot hold the {segment:,} steps that phase1 adds at once"
+            raise UserError("replay.capacity", problem, "raise it or lower phase1.envs")
+        if self.phase2.cache < 4 * self.world_model.length:
+            raise UserError("phase2.cache", "is less than four times world_model.length", "raise it")
         return self

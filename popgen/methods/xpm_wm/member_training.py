@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Loop, Pending, Progress, State, TrainedMember
 from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import Setup, Workers
@@ -21,7 +21,7 @@ class XpmWmTraining:
     learners = LEARNERS
     begins_workers = False
 
-    def __init__(self, config: RunConfig, spec: EnvSpec, work: Workers) -> None:
+    def __init__(self, config: XpmWmRun, spec: EnvSpec, work: Workers) -> None:
         self.config, self.spec, self.work = config, spec, work
         self.log_rows = max(1, config.replay.capacity // 2)
         self.weights: dict[int, Weights] = {}

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Pending, PolicySnapshot, Sampled
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.matches import Match
@@ -19,7 +19,7 @@ from popgen.types import RANDOM_MEMBER, Kind
 Pair = tuple[int, int]
 
 
-def policy_snapshot(config: RunConfig, acting: Pending[Weights]) -> PolicySnapshot:
+def policy_snapshot(config: XpmWmRun, acting: Pending[Weights]) -> PolicySnapshot:
     """A member's policy as it travels to a sampler."""
     sizes = {"world_model": config.world_model.model_dump(mode="json"), "agent": config.agent.model_dump(mode="json")}
     return PolicySnapshot("world_model", sizes, acting)

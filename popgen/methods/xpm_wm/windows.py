@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.replay import Query
 from popgen.methods.xpm_wm.start_states import NEW_SP, NEW_XP, OLD
 from popgen.methods.xpm_wm.window_requests import Request
@@ -25,7 +25,7 @@ class Draws:
     xp: tuple[Request, ...] = ()
 
 
-def model_batch(config: RunConfig, member: int) -> Draws:
+def model_batch(config: XpmWmRun, member: int) -> Draws:
     """Windows of one world-model update.
 
     Member 1 learns from everything it has, a share of it from the last rows: a policy finds the rewards that the
@@ -52,7 +52,7 @@ def major_events(spec: EnvSpec) -> tuple[int, ...]:
     return tuple(i for i, weight in enumerate(spec.event_weights) if weight > median)
 
 
-def start_batch(config: RunConfig, spec: EnvSpec, member: int, windows: int) -> Draws:
+def start_batch(config: XpmWmRun, spec: EnvSpec, member: int, windows: int) -> Draws:
     """Windows whose last states become starts of imagination for a later member.
 
     Old states: random play, the moments before a soup is taken or delivered, and late data. New states: this

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
+from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.start_states import Starts
 from popgen.nets.weights import Weights
@@ -182,7 +182,7 @@ class Setup:
     """
 
     work: Workers
-    config: RunConfig
+    config: XpmWmRun
     spec: EnvSpec
     member: int
     seed: int

@@ -1,0 +1,91 @@
+"""What a baseline's run needs, and what cannot work: actors, bytes, checks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from popgen.envs.contract import EnvSpec
+from popgen.errors import UserError
+from popgen.methods.byte_counts import FLOAT, count_numbers
+from popgen.methods.mappo.config import BaselineRun, ComediRun, LipoRun, PpoConfig
+from popgen.methods.method import ActorDemand, Needs, ask_for
+
+
+def list_actors(config: BaselineRun) -> list[ActorDemand]:
+    """Remote runners; the learner is in the driver's process."""
+    return [ask_for(config, "sampler_cpus", config.ppo.runners)]
+
+
+def estimate_mappo(config: BaselineRun, spec: EnvSpec) -> Needs:
+    """Bytes of self-play alone."""
+    return _estimate(config, spec, critics=1, environments=config.ppo.envs)
+
+
+def estimate_lipo(config: LipoRun, spec: EnvSpec) -> Needs:
+    """Bytes with cross-play: all pairs together, or those of the last member."""
+    size, together = config.population.size, config.diversity.order == "concurrent"
+    own, pairs = (size, size * (size - 1) // 2) if together else (1, size - 1)
+    environments = own * config.ppo.envs + pairs * config.diversity.xp_envs
+    return _estimate(config, spec, critics=size, environments=environments, together=size)
+
+
+def estimate_comedi(config: ComediRun, spec: EnvSpec) -> Needs:
+    """Bytes with cross-play and mixed play of the last member, and with the fresh episodes that find its strongest
+    partner, which are played at once."""
+    partners, diversity = config.population.size - 1, config.diversity
+    mixed = diversity.mp_envs if diversity.lambda_mp > 0.0 else 0
+    environments = config.ppo.envs + partners * (diversity.xp_envs + mixed)
+    fresh = 2 * diversity.select_episodes * partners
+    return _estimate(config, spec, critics=1 + 2 * partners, environments=environments, fresh=fresh)
+
+
+def _estimate(
+    config: BaselineRun, spec: EnvSpec, *, critics: int, environments: int, fresh: int = 0, together: int = 1
+) -> Needs:
+    """Bytes: an iteration's observations as they were sampled and as they are learned from, or the fresh episodes."""
+    ppo, view = config.ppo, spec.views.get(config.ppo.view)
+    if view is None:
+        return Needs(member=0, batch=0, batch_field="ppo.envs", in_driver=True)
+    row = spec.num_players * math.prod(view.shape) * np.dtype(view.dtype).itemsize
+    member = FLOAT * count_numbers(lambda: _build_networks(ppo, spec, critics))
+    return Needs(
+        member=member,
+        batch=row * max(2 * (ppo.steps + 1) * environments, (spec.horizon + 1) * fresh),
+        batch_field="ppo.envs",
+        left=member,
+        together=together,
+        in_driver=True,
+    )
+
+
+def _build_networks(ppo: PpoConfig, spec: EnvSpec, critics: int) -> list[object]:
+    from popgen.nets.feed_forward import FeedForwardNet, Sizes, joint_copies
+
+    view, players = spec.views[ppo.view], spec.num_players
+    sizes = Sizes(ppo.units, ppo.layers, ppo.activation, tuple(ppo.cnn_kernels), ppo.cnn_channels)
+    values = [FeedForwardNet(view, 1, players, sizes, joint_copies(view)) for _ in range(critics)]
+    return [FeedForwardNet(view, spec.num_actions, players, sizes), *values]
+
+
+def check_view(config: BaselineRun, spec: EnvSpec) -> None:
+    """The environment must have the networks' view.
+
+    Raises:
+        UserError: it does not.
+    """
+    view = config.ppo.view
+    if view not in spec.views:
+        raise UserError("ppo.view", f"{spec.name} has no view {view!r}", f"choose one of {', '.join(spec.views)}")
+
+
+def check_comedi(config: ComediRun, spec: EnvSpec) -> None:
+    """The view, and one member after the other.
+
+    Raises:
+        UserError: a view that the environment does not have, or another order.
+    """
+    check_view(config, spec)
+    if config.diversity.order != "sequential":
+        raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")

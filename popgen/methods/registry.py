@@ -1,0 +1,117 @@
+"""Methods by name: the built-in packages, and those that installed distributions offer as `popgen.methods`.
+
+A distribution offers a method by an entry point in its pyproject.toml (docs/adding.md):
+
+    [project.entry-points."popgen.methods"]
+    my_method = "my_package.method:METHOD"
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from popgen.config.run_config import RunConfig, field_names
+from popgen.errors import UserError
+from popgen.methods.method import Method
+
+GROUP = "popgen.methods"
+
+BUILT_IN: dict[str, str] = {
+    "xpm_wm": "popgen.methods.xpm_wm.method:METHOD",
+    "xpm_sim": "popgen.methods.xpm_sim.method:METHOD",
+    "lipo": "popgen.methods.mappo.method:LIPO",
+    "comedi": "popgen.methods.mappo.method:COMEDI",
+    "mappo": "popgen.methods.mappo.method:MAPPO",
+}
+"""name -> `module:record`, imported when first needed."""
+
+DEFAULT = "xpm_wm"
+"""The method of a configuration that names none."""
+
+DEFAULT_RECIPE = "laptop"
+
+
+@cache
+def _offered() -> dict[str, EntryPoint]:
+    """Methods of other distributions; a built-in name cannot be taken."""
+    return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN}
+
+
+@cache
+def _load_method(name: str) -> Method:
+    if name in BUILT_IN:
+        module, _, record = BUILT_IN[name].partition(":")
+        return getattr(import_module(module), record)
+    entry = _offered()[name]
+    try:
+        method = entry.load()
+    except Exception as error:  # whatever a package of others raises when it is imported
+        raise UserError("method", f"{name} ({entry.value}) cannot be imported: {error}", "repair its package") from None
+    if not isinstance(method, Method) or method.name != name:
+        problem = f"{entry.value} is no popgen.methods.method.Method with the name {name!r}"
+        raise UserError("method", problem, "repair its package")
+    return method
+
+
+class Methods(Mapping[str, Method]):
+    """All methods; a record is imported when it is asked for."""
+
+    def __getitem__(self, name: str) -> Method:
+        if name not in self:
+            raise KeyError(name)
+        return _load_method(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in BUILT_IN or name in _offered()
+
+    def __iter__(self) -> Iterator[str]:
+        yield from BUILT_IN
+        yield from _offered()
+
+    def __len__(self) -> int:
+        return len(BUILT_IN) + len(_offered())
+
+
+METHODS = Methods()
+
+
+def find_method(name: object) -> Method:
+    """The method that a configuration names.
+
+    Raises:
+        UserError: there is no such method.
+    """
+    if name in METHODS:
+        return METHODS[str(name)]
+    close = difflib.get_close_matches(str(name), METHODS, n=1)
+    fix = f"did you mean {close[0]}?" if close else f"choose one of {', '.join(METHODS)}"
+    raise UserError("method", f"there is no method {name!r}", fix)
+
+
+def methods_with(key: str) -> list[str]:
+    """Names of the methods whose schema has a dotted field."""
+    return [name for name, method in METHODS.items() if key in field_names(method.config)]
+
+
+def policy_kinds() -> dict[str, str]:
+    """Kinds of the policies that methods save -> `module:class`."""
+    return {kind: place for method in METHODS.values() for kind, place in method.policies.items()}
+
+
+def recipe(method: str, env: str = "overcooked/cramped_room", scale: str = DEFAULT_RECIPE) -> RunConfig:
+    """The complete configuration of a recipe on a layout: what the command line would start with.
+
+    Raises:
+        UserError: no such method or recipe.
+    """
+    found = find_method(method)
+    if scale not in found.recipes:
+        raise UserError("scale", f"{method} has no recipe {scale!r}", f"choose one of {', '.join(found.recipes)}")
+    values: dict[str, Any] = found.recipes[scale].values(env)
+    env_values = {**values.pop("env", {}), "name": env}
+    return RunConfig.parse({**values, "method": method, "scale": scale, "env": env_values})

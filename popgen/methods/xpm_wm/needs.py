@@ -1,0 +1,83 @@
+"""What an XPM-WM run needs, and what cannot work: actors, bytes, checks."""
+
+from __future__ import annotations
+
+from popgen.envs.contract import EnvSpec
+from popgen.errors import UserError
+from popgen.methods.byte_counts import FLOAT, buffer_bytes, count_numbers, observation_entries, segment_bytes
+from popgen.methods.method import ActorDemand, Needs, ask_for
+from popgen.methods.xpm_wm.config import OPEN_LOOP, PREFILL_CHUNK, XpmWmRun
+
+
+def list_actors(config: XpmWmRun) -> list[ActorDemand]:
+    """Samplers, two replays and two learners."""
+    cluster = config.cluster
+    return [
+        ask_for(config, "sampler_cpus", cluster.samplers),
+        ask_for(config, "replay_cpus", 2),
+        ask_for(config, "model_cpus", 1, cluster.model_gpus),
+        ask_for(config, "agent_cpus", 1, cluster.agent_gpus),
+    ]
+
+
+def estimate_needs(config: XpmWmRun, spec: EnvSpec) -> Needs:
+    """Bytes. A finished member leaves the buffers behind, and the world model with its optimiser; the running one's
+    checkpoints hold two copies and a log of the buffers, and one more is being written."""
+    model, agent = config.world_model, config.agent
+    member = FLOAT * count_numbers(lambda: _build_networks(config, spec)) if model.view in spec.views else 0
+    buffers = 2 * buffer_bytes(config.replay.capacity, spec)
+    windows = model.batch * model.length * spec.num_players * observation_entries(spec, model.view)
+    latents = (agent.starts_sp + agent.starts_xp) * agent.horizon * (model.deter + model.classes * model.groups)
+    rows = config.phase1.envs * max(PREFILL_CHUNK, config.phase1.steps_per_iteration)
+    return Needs(
+        member=member,
+        batch=FLOAT * max(windows, latents),
+        batch_field="agent.horizon",
+        buffers=buffers,
+        buffers_field="replay.capacity",
+        in_flight=2 * segment_bytes(rows, spec),
+        left=buffers + 3 * member,
+        buffer_copies=4,
+    )
+
+
+def _build_networks(config: XpmWmRun, spec: EnvSpec) -> list[object]:
+    """World model, actor, and a critic for each partner of the last member."""
+    from popgen.methods.xpm_wm.actor_critic import Actor, Critic
+    from popgen.methods.xpm_wm.world_model import WorldModel
+
+    model, agent = config.world_model, config.agent
+    critics = [Critic(agent, model) for _ in range(config.population.size)]
+    return [WorldModel(model, spec), Actor(agent, model, spec.num_actions), *critics]
+
+
+def check_run(config: XpmWmRun, spec: EnvSpec) -> None:
+    """Refuse what does not fit the environment.
+
+    Raises:
+        UserError: a view it does not have, no events that pay, windows or rounds too long for it.
+    """
+    _check_view(config, spec)
+    if not any(spec.event_weights):  # the imagined reward is made of events alone
+        problem = f"{config.method} needs an environment with weighted events, {spec.name} has none"
+        raise UserError("env.name", problem, "choose another environment")
+    _check_lengths(config, spec)
+
+
+def _check_view(config: XpmWmRun, spec: EnvSpec) -> None:
+    view = config.world_model.view
+    if view not in spec.views:
+        raise UserError(
+            "world_model.view", f"{spec.name} has no view {view!r}", f"choose one of {', '.join(spec.views)}"
+        )
+
+
+def _check_lengths(config: XpmWmRun, spec: EnvSpec) -> None:
+    window, phase = config.world_model.length + OPEN_LOOP, config.phase2
+    if window > spec.horizon:
+        problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
+        raise UserError("world_model.length", f"{problem} ({spec.horizon})", "shorten them")
+    added = max(phase.episodes_sp, phase.episodes_xp) * (spec.horizon + 1)
+    if config.replay.capacity < added:
+        problem = f"cannot hold the {added:,} steps that phase2 adds at once"
+        raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
