@@ -24,7 +24,7 @@ ORDER = (
     "pipelines",
     *("conf", "cli", "__main__"),
 )
-UPWARD = {("config", "methods")}  # the one arrow that runs back up: `RunConfig` names the sections of each method
+UPWARD: set[tuple[str, str]] = set()
 OWNERS = {  # outside package -> folders and files where it may be imported
     "ray": ("actors", "pipelines", "popgen/methods/mappo", "popgen/runs/recovery.py", "popgen/runs/monitoring.py"),
     "hydra": ("popgen/cli/compose.py",),
