@@ -36,6 +36,21 @@ ACTION_NAMES = ("stay", "left", "right", "down", "up")
 FORCES = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=np.float64)
 STATE_SIZE = 9
 """(x, y, vx, vy) of player 0, the same of player 1, time step."""
+RULES = (
+    "timestep",
+    "damping",
+    "sensitivity",
+    "bounds",
+    "landmark_distance",
+    "start_distance",
+    "start_noise",
+    "horizon",
+    "distance",
+    "exit_penalty",
+    "exit_reward",
+    "integration",
+)
+"""Parameters that decide what happens: attributes of `RendezvousEnv`, the specification's `params`."""
 
 _TIME = 8
 _LANDMARKS = 4
@@ -106,49 +121,16 @@ class RendezvousEnv(BatchedEnv):
         self.distance = _check_choice("distance", distance, ("full", "centroid"))
         self.exit_penalty = _check_choice("exit_penalty", exit_penalty, ("absorbing", "none"))
         self.integration = _check_choice("integration", integration, ("velocity_first", "position_first"))
-        self.exit_reward = self._resolve_exit_reward(exit_reward)
+        self.exit_reward = _resolve_exit_reward(
+            exit_reward, self.exit_penalty, worst_reward(self.bounds, self.landmark_distance, self.distance)
+        )
         self.num_envs = _check_integer("num_envs", num_envs, 1, 2**31)
         corner = self.landmark_distance
         self.landmarks = np.array([(x, y) for x in (-corner, corner) for y in (-corner, corner)])
-        self.spec = make_spec(variant, self._list_rules(), self._largest_feature())
+        self.spec = make_spec(variant, {name: getattr(self, name) for name in RULES})
         self._states = np.zeros((self.num_envs, STATE_SIZE))
         self._rng = np.random.default_rng(_check_integer("seed", seed, 0, 2**63))
         self.reset()
-
-    def _resolve_exit_reward(self, value: float | None) -> float:
-        if self.exit_penalty == "none":
-            if value:
-                raise UserError(
-                    "env.exit_reward", "has no meaning with exit_penalty=none", "use exit_penalty=absorbing"
-                )
-            return 0.0
-        if value is None:
-            return worst_reward(self.bounds, self.landmark_distance, self.distance)
-        return _check_number("exit_reward", value, -_LIMIT, 0.0)
-
-    def _list_rules(self) -> dict[str, Any]:
-        """Everything that decides what happens, by the names of the parameters."""
-        return {
-            "timestep": self.timestep,
-            "damping": self.damping,
-            "sensitivity": self.sensitivity,
-            "bounds": self.bounds,
-            "landmark_distance": self.landmark_distance,
-            "start_distance": self.start_distance,
-            "start_noise": self.start_noise,
-            "horizon": self.horizon,
-            "distance": self.distance,
-            "exit_penalty": self.exit_penalty,
-            "exit_reward": self.exit_reward,
-            "integration": self.integration,
-        }
-
-    def _largest_feature(self) -> float:
-        """Bound on every feature's magnitude in an episode: speed, overshoot at the exit, relative landmarks."""
-        kept = 1.0 - self.damping
-        steps = self.horizon if self.damping == 0.0 else (1.0 - kept**self.horizon) / self.damping
-        speed = self.sensitivity * self.timestep * steps
-        return max(1.0, speed, self.bounds + speed * self.timestep + self.landmark_distance)
 
     def reset(self, seed: int | None = None, indices: np.ndarray | None = None) -> None:
         """Put the players at their starts, at rest, at time 0; rows draw noise in the order of `indices`."""
@@ -201,7 +183,7 @@ class RendezvousEnv(BatchedEnv):
         left = (np.abs(position) > self.bounds).any(axis=-1)
         terminated = left.any(axis=-1)
         penalty = np.where(terminated, np.maximum(self.horizon - time, 0.0) * self.exit_reward, 0.0)
-        reward = np.asarray(self._reward_positions(position) + penalty, dtype=np.float32)
+        reward = np.asarray(reward_positions(position, self.landmarks, self.distance) + penalty, dtype=np.float32)
         return StepBatch(
             reward=reward,
             score=reward.copy(),
@@ -209,14 +191,6 @@ class RendezvousEnv(BatchedEnv):
             terminated=terminated,
             truncated=(time >= self.horizon) & ~terminated,
         )
-
-    def _reward_positions(self, position: np.ndarray) -> np.ndarray:
-        """Joint reward (...) float64 of positions (..., P, 2), without the exit penalty."""
-        first, second = position[..., 0, :], position[..., 1, :]
-        centroid = (first + second) / 2.0
-        nearest = _measure_length(self.landmarks - centroid[..., None, :]).min(axis=-1)
-        apart = _measure_length(first - second) if self.distance == "full" else _measure_length(first - centroid)
-        return 1.0 - nearest - apart
 
     def get_state(self, indices: np.ndarray | None = None) -> np.ndarray:
         """Copy of the states (B, S) float64, of all environments or of `indices`."""
@@ -241,18 +215,7 @@ class RendezvousEnv(BatchedEnv):
         """Features (..., P, 25) float32 of states (..., S); raises ValueError on another view."""
         if view not in self.spec.views:
             raise ValueError(f"view: {view!r} is unknown, this environment has {', '.join(self.spec.views)}")
-        states = np.asarray(states)
-        check(states, (*states.shape[:-1], STATE_SIZE), "states")
-        lead = states.shape[:-1]
-        bodies = states[..., :_TIME].reshape(*lead, 2, 4)
-        landmarks = (self.landmarks - bodies[..., None, :2]).reshape(*lead, 2, 2 * _LANDMARKS)
-        features = np.empty((*lead, 2, len(_SWAP)), dtype=np.float32)
-        features[..., 0:4] = bodies
-        features[..., 4:8] = bodies[..., ::-1, :]
-        features[..., 8:16] = landmarks
-        features[..., 16:24] = landmarks[..., ::-1, :]
-        features[..., 24] = states[..., _TIME, None] / self.horizon
-        return features
+        return encode_features(states, self.landmarks, self.horizon)
 
     def time(self, states: np.ndarray) -> np.ndarray:
         """Time steps (...) int64 of states (..., S)."""
@@ -283,8 +246,41 @@ class RendezvousEnv(BatchedEnv):
         return self._states[index, :_TIME].reshape(2, 4)
 
 
-def make_spec(variant: str, rules: dict[str, Any], largest: float) -> EnvSpec:
-    """The record that the rest of popgen works with; `largest` bounds the features' magnitude."""
+def encode_features(states: np.ndarray, landmarks: np.ndarray, horizon: int) -> np.ndarray:
+    """Features (..., P, 25) float32 of states (..., S), see `RendezvousEnv`; landmarks are (4, 2)."""
+    states = np.asarray(states)
+    check(states, (*states.shape[:-1], STATE_SIZE), "states")
+    lead = states.shape[:-1]
+    bodies = states[..., :_TIME].reshape(*lead, 2, 4)
+    relative = (landmarks - bodies[..., None, :2]).reshape(*lead, 2, 2 * _LANDMARKS)
+    features = np.empty((*lead, 2, len(_SWAP)), dtype=np.float32)
+    features[..., 0:4] = bodies
+    features[..., 4:8] = bodies[..., ::-1, :]
+    features[..., 8:16] = relative
+    features[..., 16:24] = relative[..., ::-1, :]
+    features[..., 24] = states[..., _TIME, None] / horizon
+    return features
+
+
+def reward_positions(position: np.ndarray, landmarks: np.ndarray, distance: str) -> np.ndarray:
+    """Joint reward (...) float64 of positions (..., P, 2), without the exit penalty; landmarks are (4, 2)."""
+    first, second = position[..., 0, :], position[..., 1, :]
+    centroid = (first + second) / 2.0
+    nearest = _measure_length(landmarks - centroid[..., None, :]).min(axis=-1)
+    apart = _measure_length(first - second) if distance == "full" else _measure_length(first - centroid)
+    return 1.0 - nearest - apart
+
+
+def largest_feature(rules: dict[str, Any]) -> float:
+    """Bound on every feature's magnitude in an episode: speed, overshoot at the exit, relative landmarks."""
+    kept = 1.0 - rules["damping"]
+    steps = rules["horizon"] if rules["damping"] == 0.0 else (1.0 - kept ** rules["horizon"]) / rules["damping"]
+    speed = rules["sensitivity"] * rules["timestep"] * steps
+    return max(1.0, speed, rules["bounds"] + speed * rules["timestep"] + rules["landmark_distance"])
+
+
+def make_spec(variant: str, rules: dict[str, Any]) -> EnvSpec:
+    """The record that the rest of popgen works with."""
     facts = json.dumps({"family": "rendezvous", "version": 1, **rules}, sort_keys=True)
     return EnvSpec(
         name=f"rendezvous/{variant}",
@@ -293,7 +289,7 @@ def make_spec(variant: str, rules: dict[str, Any], largest: float) -> EnvSpec:
         action_names=ACTION_NAMES,
         state_size=STATE_SIZE,
         state_dtype="float64",
-        views={"features": ViewSpec((len(_SWAP),), "float32", binary=False, scale=largest, swap=_SWAP)},
+        views={"features": ViewSpec((len(_SWAP),), "float32", binary=False, scale=largest_feature(rules), swap=_SWAP)},
         event_names=("leaves_bounds",),
         event_weights=(0.0,),
         score_name="return",
@@ -316,6 +312,15 @@ def worst_reward(bounds: float, landmark_distance: float, distance: str = "full"
         for u, v in ((0.0, 0.0), (bounds, 0.0), (bounds, bounds))
     )
     return 1.0 - loss
+
+
+def _resolve_exit_reward(value: float | None, penalty: str, worst: float) -> float:
+    """The reward per remaining step that a rule of exits charges; `worst` where none is given."""
+    if penalty == "none":
+        if value:
+            raise UserError("env.exit_reward", "has no meaning with exit_penalty=none", "use exit_penalty=absorbing")
+        return 0.0
+    return worst if value is None else _check_number("exit_reward", value, -_LIMIT, 0.0)
 
 
 def _checked_states(states: np.ndarray) -> np.ndarray:

@@ -54,13 +54,11 @@ class XpmSimTraining:
         self.policy = make_actor(self.config, spec)
         self.archive: dict[int, Pending[Weights]] = {}
         self.encoder: Pending[State | None] | None = None
-        self._start_fresh(0, 0)
-
-    def _start_fresh(self, member: int, seed: int) -> None:
-        self.member, self.seed, self.partners = member, seed, sorted(self.archive)
-        self.pairs = seatings(member, self.partners, seed)
+        self.member, self.seed = 0, 0
+        self.partners: list[int] = []
+        self.pairs: list[tuple[int, int]] = []
         self.progress, self.strength = MemberProgress(), PartnerStrength(self.config.partner)
-        self.acting: Pending[Weights] = self.workers.put({})
+        self.acting: Pending[Weights] = workers.put({})
 
     def train(self) -> Loop:
         """Real episodes and updates in turn, to the end of the member."""
@@ -165,7 +163,10 @@ class XpmSimTraining:
 
     def begin(self, first: int) -> tuple[int, ...]:
         """See `Training`."""
-        self._start_fresh(first, self.run.seed * 1000 + first)
+        self.member, self.seed = first, self.run.seed * 1000 + first
+        self.partners = sorted(self.archive)
+        self.pairs = seatings(first, self.partners, self.seed)
+        self.progress, self.strength = MemberProgress(), PartnerStrength(self.config.partner)
         self.acting = self.workers.begin_member(first, self.seed, self.archive, self.encoder)
         self.policy.load(self.acting.result())
         return (first,)
