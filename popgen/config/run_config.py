@@ -30,13 +30,21 @@ class RunConfig(Schema):
     """The sections that every run has; each method's own class adds its sections (`popgen/methods/*/config.py`)."""
 
     method: str
+    """How the population is generated: a name of `popgen.methods.registry.METHODS`."""
     scale: str = "laptop"
+    """Recipe that gives the numbers: laptop, demo, paper, smoke, or a preset of yours."""
     env: EnvConfig = EnvConfig()
+    """What is played."""
     population: PopulationConfig = PopulationConfig()
+    """How many members there are, and which of them come from an earlier run."""
     evaluation: EvaluationConfig = EvaluationConfig()
+    """How the finished population is measured."""
     cluster: ClusterConfig = ClusterConfig()
+    """Where actors run, and what each asks of its node."""
     tracking: TrackingConfig = TrackingConfig()
+    """How MLflow follows the run."""
     run: RunSection = RunSection()
+    """Identity, place, seed and schedule of the run."""
 
     @classmethod
     def parse(cls, values: dict[str, Any]) -> RunConfig:

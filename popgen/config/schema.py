@@ -29,6 +29,9 @@ Text = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is
 
 
 class Schema(BaseModel):
-    """Immutable, no unknown keys, no silent conversion of text to numbers."""
+    """Immutable, no unknown keys, no silent conversion of text to numbers.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+    The sentence below a field, a string of its own, is the field's description: `popgen config` shows it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False, use_attribute_docstrings=True)

@@ -14,7 +14,9 @@ class EnvConfig(Schema):
     """An environment of the registry; `params` go to its constructor."""
 
     name: str = "overcooked/cramped_room"
+    """Family and variant, such as overcooked/cramped_room; a path to a .layout file may follow `overcooked/`."""
     params: dict[str, Any] = {}
+    """Arguments of the environment's constructor, by name; {} leaves its own defaults."""
 
     @model_validator(mode="after")
     def _seed_is_the_runs(self) -> EnvConfig:
@@ -27,68 +29,84 @@ class PopulationConfig(Schema):
     """Size of the population and, for continuing one, the run whose members it starts from."""
 
     size: Annotated[_Int, Field(ge=1, le=1000)] = 3
+    """Members of the population (the paper's M)."""
     init_from: str | None = None
+    """Folder of a run whose first members this population takes over and goes on from; null trains all."""
     init_members: Positive = 1
+    """How many members to take over from `init_from`."""
 
 
 class EvaluationConfig(Schema):
     """Episodes behind each figure of the SP/XP matrix (per seating)."""
 
     episodes: Batch = 20
+    """Episodes behind each figure of the SP/XP matrix, for each pair of members in each seating."""
 
 
 class ClusterConfig(Schema):
-    """Where actors run; `address=None` starts a local Ray.
-
-    retries: deaths of actors or nodes in a row, without progress between them, after which a run gives up.
-    wait_seconds: for nodes of a running cluster that are not up (again).
-    object_store_bytes: of each node's object store; None leaves it to Ray (3/10 of the memory).
-    """
+    """Ray: the cluster, and the cores, cards and memory of actors."""
 
     address: str | None = None
+    """Ray cluster to join (`auto` finds the one that runs here); null starts a local Ray."""
     num_cpus: Annotated[_Int, Field(ge=1, le=100_000)] | None = None
+    """Cores that a local Ray may use; null: all of this machine."""
     samplers: Annotated[_Int, Field(ge=1, le=10_000)] = 1
+    """Actors that step environments."""
     sampler_cpus: Weight = 0.1
+    """Cores that each sampler asks Ray for."""
     replay_cpus: Weight = 0.0
+    """Cores that each replay buffer asks Ray for."""
     model_cpus: Weight = 0.9
+    """Cores that the world model's learner asks Ray for."""
     agent_cpus: Weight = 0.9
+    """Cores that each member's learner asks Ray for."""
     model_gpus: Weight = 0.0
+    """GPUs that the world model's learner asks Ray for; 0 computes on the processor."""
     agent_gpus: Weight = 0.0
+    """GPUs that each member's learner asks Ray for; 0 computes on the processor."""
     threads: Annotated[_Int, Field(ge=1, le=1024)] = 1
+    """Threads that each learner computes with."""
     resources: dict[str, Weight] = {}
+    """Ray's custom resources that every actor asks for, by name, to bind a run to certain nodes."""
     retries: Annotated[_Int, Field(ge=0, le=1000)] = 5
+    """Deaths of actors or nodes in a row, without progress between them, that a run survives."""
     wait_seconds: Weight = 600.0
+    """Seconds to wait for nodes of a running cluster that are not up (again)."""
     object_store_bytes: Annotated[_Int, Field(ge=80 * 2**20, le=2**50)] | None = None
+    """Bytes of each node's object store; null leaves it to Ray (3/10 of the memory)."""
 
 
 class TrackingConfig(Schema):
-    """MLflow; without a URI a sqlite store in the run's folder.
-
-    system_metrics: processor, memory, disk and network of the machine that holds the tracker, every 10 s.
-    """
+    """MLflow."""
 
     enabled: StrictBool = True
+    """Whether MLflow follows the run."""
     uri: str | None = None
+    """MLflow's tracking URI; null keeps a sqlite store in the run's folder."""
     experiment: str = "popgen"
+    """Name of the MLflow experiment."""
     system_metrics: StrictBool = False
+    """Log processor, memory, disk and network of the tracker's machine every 10 s."""
 
 
 class RunSection(Schema):
-    """Identity and place of the run.
-
-    transport: where workers are: Ray's actors, or objects of the driver's process (`inline`: a notebook, a debugger).
-    overlap: with schedule=async, rounds that a learner may do for each of the samplers'.
-    checkpoint_seconds: least time between two checkpoints; 0: after every iteration.
-    disk_reserve: bytes; with less room left the run stops by itself, its checkpoints whole.
-    storage: a second place for everything that resuming needs, such as s3://bucket/path (docs/reliability.md).
-    """
+    """What is not of the method but of this one run."""
 
     id: Text | None = None
+    """Name of the run and of its folder; the same name goes on where an interrupted run was; null makes one."""
     root: str = "runs"
+    """Folder that holds the runs' folders."""
     seed: Annotated[_Int, Field(ge=0, lt=2**31)] = 0
+    """Seed of all randomness of the run."""
     schedule: Literal["sync", "async"] = "sync"
+    """`sync` waits for all workers in every round (same seed, same weights); `async` lets them overlap."""
     transport: Literal["ray", "inline"] = "ray"
+    """Where workers live: Ray's actors, or objects of the driver's process (`inline`: notebook, debugger)."""
     overlap: Annotated[_Int, Field(ge=1, le=1000)] = 4
+    """With schedule=async, tasks that a learner may do for each one of the samplers."""
     checkpoint_seconds: Weight = 0.0
+    """Least seconds between two checkpoints; 0 makes one after every round."""
     disk_reserve: Annotated[_Int, Field(ge=0, le=2**50)] = 64 * 2**20
+    """Bytes to leave free: with less room on the disk the run stops by itself, its checkpoints whole."""
     storage: str | None = None
+    """Second place for all that resuming needs, such as s3://bucket/path (docs/reliability.md); null: none."""

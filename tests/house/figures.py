@@ -296,18 +296,21 @@ def measure_docstrings(root: Path) -> Share:
 
 
 def find_undescribed_fields(root: Path) -> list[str]:
-    """Fields of the configuration's JSON schema without a description."""
+    """Fields of the methods' JSON schemas without a description, each once."""
     sys.path.insert(0, str(root))
-    from popgen.config.run_config import RunConfig
+    from popgen.methods.registry import METHODS
 
-    schema = RunConfig.model_json_schema()
-    models = {schema["title"]: schema, **schema.get("$defs", {})}
-    return [
-        f"{model}.{field}"
-        for model, body in models.items()
-        for field, entry in body.get("properties", {}).items()
-        if "description" not in entry
-    ]
+    lines: set[str] = set()
+    for method in METHODS.values():
+        schema = method.config.model_json_schema()
+        models = {schema["title"]: schema, **schema.get("$defs", {})}
+        lines |= {
+            f"{model}.{field}"
+            for model, body in models.items()
+            for field, entry in body.get("properties", {}).items()
+            if not entry.get("description", "").strip()
+        }
+    return sorted(lines)
 
 
 @dataclass(frozen=True)

@@ -16,40 +16,57 @@ _Kernel = Annotated[_Int, Field(ge=1, le=31)]
 class PpoConfig(Schema):
     """MAPPO (Yu et al. 2022): decentralised actors, a centralised critic, the clipped surrogate.
 
-    Networks: of actors and critics alike, each with weights of its own; `cnn_kernels` for a grid view only.
-    Rollouts: `envs` self-play environments per member, `steps` of each in every iteration, shared by `runners` remote
-        processes (0: none, this process steps them).
-    Updates: the learning rate and the entropy bonus go in a straight line to `..._end` times their value at
-        `max_steps`. `value_decay` is of the moving statistics that normalise the returns, per iteration.
-    End: a member's training ends with the iteration in which its self-play has taken `max_steps`; or earlier, once the
-        mean score of its last `window` self-play episodes has reached `target_score` (and, in a method with
-        cross-play, the strongest partner's is at most `diversity.target_xp`).
+    Actors and critics have the same sizes and weights of their own. A member's training ends with an iteration.
     """
 
     view: Literal["features", "lossless"] = "features"
+    """What actors and critics see: a flat vector of features, or the lossless grid (which needs `cnn_kernels`)."""
     units: Width = 128
+    """Width of the hidden layers."""
     layers: Layers = 2
+    """Hidden layers of each network."""
     activation: Literal["tanh", "leaky_relu"] = "tanh"
+    """Nonlinearity of the hidden layers."""
     cnn_kernels: Annotated[tuple[_Kernel, ...], Field(max_length=16)] = ()
+    """Sizes of the convolutions' kernels, odd, one a layer; only for the lossless view."""
     cnn_channels: Width = 32
+    """Channels of each convolution."""
     envs: Batch = 64
+    """Self-play environments of each member."""
     steps: Annotated[_Int, Field(ge=1, le=100_000)] = 100
+    """Steps of each environment in every iteration."""
     runners: Annotated[_Int, Field(ge=0, le=10_000)] = 0
+    """Remote processes that share the environments; 0: the learner's process steps them."""
     epochs: Annotated[_Int, Field(ge=1, le=1000)] = 4
+    """Passes over an iteration's samples."""
     minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 4
+    """Parts into which each pass divides the samples, a gradient step each."""
     clip: Rate = 0.2
+    """Largest change of the probability ratio that the surrogate rewards (PPO's epsilon)."""
     discount: Fraction = 0.99
+    """Discount of rewards per step (gamma)."""
     lam: Fraction = 0.95
+    """Lambda of the generalised advantage estimate: 0 trusts the critic, 1 the returns."""
     learning_rate: Rate = 1e-3
+    """Adam's step size at the start, of actors and critics."""
     learning_rate_end: Fraction = 1.0
+    """Share of `learning_rate` that is left at `max_steps`; it falls in a straight line."""
     entropy: Weight = 0.01
+    """Weight of the policy's entropy at the start (the paper's entropy coef.)."""
     entropy_end: Fraction = 1.0
+    """Share of `entropy` that is left at `max_steps`; it falls in a straight line."""
     grad_clip: Weight = 0.5
+    """Largest norm of a gradient; longer ones are scaled down."""
     value_weight: Weight = 1.0
+    """Weight of the critic's loss beside the policy's."""
     value_decay: Fraction = 0.9
+    """Decay per iteration of the moving mean and variance that normalise the returns."""
     max_steps: Positive = 800_000
+    """Self-play environment steps that end a member's training."""
     target_score: Weight = 10.5
+    """Mean self-play score that ends it earlier; with partners `diversity.target_xp` must hold too."""
     window: Positive = 64
+    """Latest self-play episodes behind that mean."""
 
     @model_validator(mode="after")
     def _fits(self) -> PpoConfig:
@@ -66,61 +83,64 @@ class PpoConfig(Schema):
 
 
 class DiversityConfig(Schema):
-    """Cross-play and mixed play of LIPO and CoMeDi (paper, equations LIPO and CoMeDi).
-
-    order: `concurrent` trains all members together, each the others' partner; `sequential` one after the other against
-        frozen predecessors. CoMeDi is sequential.
-    lambda_xp, lambda_mp: weights of cross-play and mixed play beside self-play's 1; lambda_xp rises in a straight line
-        over the first `warmup` iterations. With lambda_mp=0 no mixed play is sampled.
-    xp_envs, mp_envs: environments with each partner, half of them in each seating.
-    xp_loss: `signed` negates the advantage before the clipped surrogate, `negated` the surrogate after it, as two
-        published code bases do.
-    partner_random: share of iterations in which a random partner takes the strongest one's place, so that the critics
-        of the others are not forgotten.
-    window: episodes with a partner (both seatings) behind its return. CoMeDi instead plays `select_episodes` fresh
-        episodes with each partner in each seating, every `select_every` iterations, and goes by all of these.
-    target_xp: see `ppo.target_score`.
-    """
+    """Cross-play and mixed play of LIPO and CoMeDi (paper, equations LIPO and CoMeDi)."""
 
     order: Literal["concurrent", "sequential"] = "concurrent"
+    """`concurrent`: all members at once, each the others' partner; `sequential`: against frozen predecessors."""
     lambda_xp: Weight = 0.25
+    """Weight of cross-play with the strongest partner beside self-play's 1 (lambda_XP, eq. LIPO and CoMeDi)."""
     lambda_mp: Weight = 0.25
+    """Weight of mixed play beside self-play's 1 (lambda_MP, eq. CoMeDi); 0 samples none."""
     warmup: NonNegative = 10
+    """Iterations over which lambda_XP rises in a straight line from 0; 0: full weight at once."""
     xp_envs: Annotated[_Int, Field(ge=2, le=100_000, multiple_of=2)] = 32
+    """Cross-play environments with each partner, half of them in each seating."""
     mp_envs: Annotated[_Int, Field(ge=2, le=100_000, multiple_of=2)] = 32
+    """Mixed-play environments with each partner, half of them in each seating."""
     xp_loss: Literal["signed", "negated"] = "signed"
+    """`signed` negates the advantage before the clipped surrogate; `negated` the surrogate after it."""
     partner_random: Fraction = 0.15
+    """Share of iterations with a random partner in the strongest one's place: no critic is forgotten."""
     window: Positive = 32
+    """Latest cross-play episodes with a partner, both seatings, behind its return (LIPO)."""
     select_every: Positive = 5
+    """Iterations between two choices of the strongest partner by fresh episodes (CoMeDi)."""
     select_episodes: Batch = 2
+    """Fresh episodes with each partner in each seating behind such a choice (CoMeDi)."""
     target_xp: Weight = 2.0
+    """Largest mean cross-play score, with any partner, at which `ppo.target_score` may end the training."""
 
 
 class BaselineRun(RunConfig):
     """What the runs of all baselines have."""
 
     ppo: PpoConfig = PpoConfig()
+    """Networks, rollouts and updates of MAPPO."""
 
 
 class MappoRun(BaselineRun):
     """A run of MAPPO: self-play alone."""
 
     method: Literal["mappo"] = "mappo"
+    """Self-play alone."""
 
 
 class PartnerRun(BaselineRun):
     """What the runs of baselines that meet partners have."""
 
     diversity: DiversityConfig = DiversityConfig()
+    """Cross-play and mixed play with other members."""
 
 
 class LipoRun(PartnerRun):
     """A run of LIPO."""
 
     method: Literal["lipo"] = "lipo"
+    """Self-play less cross-play with the strongest partner."""
 
 
 class ComediRun(PartnerRun):
     """A run of CoMeDi."""
 
     method: Literal["comedi"] = "comedi"
+    """The same, with mixed play, against frozen predecessors."""

@@ -34,38 +34,67 @@ class WorldModelConfig(Schema):
     """The two-player RSSM (paper, section 4.1 and the table of XPM-WM hyper-parameters)."""
 
     view: Literal["features", "lossless"] = "features"
+    """What the model sees and reconstructs: a flat vector of features, or the lossless grid."""
     encoder_layers: Layers = 2
+    """Hidden layers of the encoder, after any convolutions."""
     decoder_layers: Layers = 2
+    """Hidden layers of the decoder, before any convolutions."""
     cnn_kernels: Annotated[tuple[Annotated[_Int, Field(ge=1, le=31)], ...], Field(min_length=1, max_length=16)] = (
         5,
         3,
         3,
     )
+    """Sizes of the convolutions' kernels, odd, one a layer; used by the lossless view alone."""
     cnn_channels: Width = 32
+    """Channels of each convolution."""
     units: Width = 128
+    """Width of the hidden layers."""
     deter: Width = 128
+    """Width of the recurrent state h."""
     recurrent_units: Annotated[_Int, Field(ge=0, le=16_384)] = 256
+    """Width of the layer before the GRU; 0 leaves it out."""
     prior_layers: Layers = 1
+    """Hidden layers of the prior p(z | h)."""
     posterior_layers: Layers = 1
+    """Hidden layers of the posterior q(z | h, o)."""
     head_layers: Layers = 2
+    """Hidden layers of the event (reward) and continue predictors."""
     groups: Annotated[_Int, Field(ge=1, le=1024)] = 32
+    """Categorical variables of the latent z in all (the paper's N)."""
     joint_groups: Positive = 16
+    """Those of them that both players share (the paper's K); each player has half of the others."""
     classes: Annotated[_Int, Field(ge=2, le=256)] = 8
+    """Values of each categorical variable."""
     unimix: UniformShare = 0.01
+    """Share of the uniform distribution that is mixed into every categorical variable."""
     activation: Literal["silu", "leaky_relu"] = "silu"
+    """Nonlinearity of the hidden layers."""
     norm: StrictBool = True
+    """Whether each hidden layer has a layer norm before its nonlinearity."""
     learning_rate: Rate = 2e-3
+    """Adam's step size in phase 1."""
     grad_clip: Weight = 100.0
+    """Largest norm of the model's gradient; longer ones are scaled down."""
     batch: Batch = 64
+    """Windows in one update."""
     length: Annotated[_Int, Field(ge=2, le=1024)] = 8
+    """States in a window."""
     kl_dyn: Weight = 1.0
+    """Weight of the KL that draws the prior to the posterior (eq. WM, KL balancing)."""
     kl_rep: Weight = 0.03
+    """Weight of the KL that draws the posterior to the prior (eq. WM, KL balancing)."""
     free_nats: Weight = 1.0
+    """KL in nats below which neither of the two is reduced."""
     event_scale: Weight = 3.0
+    """Weight of the events' (reward's) loss beside the observation's 1."""
     continue_scale: Weight = 1.0
+    """Weight of the continue flag's loss beside the observation's 1."""
     kl_predecessors: Weight = 0.0
+    """Weight of the KL to earlier members' archived posteriors on cross-play (eq. WM+, gamma)."""
     predecessors: Literal["partner", "latest", "all"] = "partner"
+    """Whose posteriors: of the partner in the window, of the latest member, or of all."""
     imagination: Literal["mode", "sample"] = "mode"
+    """How z is taken from the prior in imagination: its most likely value, or a sample."""
 
     @model_validator(mode="after")
     def _groups_divide(self) -> WorldModelConfig:
@@ -82,48 +111,78 @@ class WorldModelConfig(Schema):
 
 
 class AgentConfig(Schema):
-    """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim).
-
-    Every imagined batch is learned from in `epochs` passes of `minibatches`, with the `surrogate` `ppo` (clipped) or,
-    in one step, `reinforce`. Advantages are in units of their own standard deviation in self-play (`spread`) or of
-    the moving range of `return_percentiles` of self-play's `returns`.
-    """
+    """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim)."""
 
     units: Width = 128
+    """Width of the hidden layers of actor and critics."""
     layers: Layers = 2
+    """Hidden layers of actor and critics."""
     activation: Literal["silu", "leaky_relu"] = "silu"
+    """Nonlinearity of the hidden layers."""
     norm: StrictBool = True
+    """Whether each hidden layer has a layer norm before its nonlinearity."""
     actor_input: Literal["model", "latent"] = "model"
+    """What the actor sees: `model`, h with the joint and its own latent; `latent`, its own z^i alone."""
     horizon: Annotated[_Int, Field(ge=1, le=1000)] = 15
+    """Steps of an imagined trajectory (the paper's simulation horizon)."""
     starts_sp: Batch = 256
+    """Imagined self-play trajectories in an update."""
     starts_xp: Batch = 128
+    """Imagined cross-play trajectories in an update, half of them in each seat."""
     discount: Fraction = 0.99
+    """Discount of rewards per step (gamma)."""
     lam: Fraction = 0.95
+    """Lambda of the lambda-returns: 0 trusts the critic, 1 the imagined rewards."""
     surrogate: Literal["ppo", "reinforce"] = "ppo"
+    """Policy objective: `ppo`, clipped, over several passes; `reinforce`, one step a batch, as in the paper."""
     epochs: Annotated[_Int, Field(ge=1, le=1000)] = 2
+    """Passes over an imagined batch; 1 with `reinforce`."""
     minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 12
+    """Parts into which each pass divides the batch, a gradient step each; 1 with `reinforce`."""
     clip: Rate = 0.2
+    """Largest change of the probability ratio that the surrogate rewards (PPO's epsilon)."""
     advantage_unit: Literal["spread", "returns"] = "spread"
+    """Unit of all advantages: their spread in self-play, or the range of self-play's returns."""
     actor_lr: Rate = 1e-3
+    """Adam's step size of the actor."""
     critic_lr: Rate = 1e-3
+    """Adam's step size of the critics."""
     adam_eps: Rate = 1e-5
+    """Adam's epsilon, of actor and critics."""
     entropy: Weight = 0.02
+    """Weight of the policy's entropy at the start (the paper's entropy coef.)."""
     entropy_end: Weight = 0.02
-    entropy_after: Fraction = 0.5  # of a phase's target_score: the self-play at which the ramp begins
+    """Weight of the entropy after the ramp."""
+    entropy_after: Fraction = 0.5
+    """Share of a phase's target_score in real self-play at which the entropy's ramp begins."""
     entropy_ramp: NonNegative = 50
+    """Updates over which the entropy's weight goes to `entropy_end`; 0: the same throughout."""
     grad_clip: Weight = 0.5
+    """Largest norm of a gradient; longer ones are scaled down."""
     unimix: UniformShare = 0.01
+    """Share of the uniform distribution that is mixed into the policy."""
     bins: Annotated[_Int, Field(ge=3, le=10_001)] = 65
+    """Bins of the critics' two-hot distribution over returns."""
     slow_critic: Fraction = 0.0
+    """Decay per update of the critics' moving copy that gives the targets; 0: the critics themselves."""
     return_percentiles: tuple[Number, Number] = (5.0, 95.0)
+    """Percentiles of self-play's returns between which their moving range is taken, in [0, 100]."""
     lambda_xp: Weight = 0.35
+    """Weight of cross-play with the strongest partner, subtracted from self-play (lambda_XP, eq. XPM-Sim)."""
     lambda_start: Weight = 0.25
+    """lambda_XP of a member's first update, if it is less than `lambda_xp`."""
     lambda_ramp: NonNegative = 100
+    """Updates over which lambda_XP rises in a straight line; 0: `lambda_xp` at once."""
     sp_from_xp: Fraction = 0.5
+    """Of the self-play starts in a member's own data, the share in cross-play states (B_XP)."""
     xp_starts: Literal["partner", "any"] = "partner"
+    """Cross-play starts in states recorded with that partner, or with any."""
     partner: Literal["max_window", "max_buffer"] = "max_window"
+    """Strongest partner by real cross-play returns: of its latest round, or of all its episodes."""
     partner_random: Fraction = 0.3
+    """Share of updates with a random partner in the strongest one's place: no critic is forgotten."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Number format of imagination; `auto`: bfloat16 where the device multiplies it natively."""
 
     @model_validator(mode="after")
     def _percentiles_are_a_range(self) -> AgentConfig:
@@ -165,53 +224,83 @@ class ReplayConfig(Schema):
     """B_SP and B_XP."""
 
     capacity: Positive = 2_000_000
+    """Steps that each of the buffers B_SP and B_XP holds (the paper's buffer size)."""
     event_fraction: Fraction = 0.4
+    """Share of a model batch's windows that are drawn for an event in them, the kinds in turn."""
 
 
 class Phase1Config(Schema):
-    """Member 1: self-play together with the world model.
-
-    event_starts: when imagination also starts from windows that were drawn for an event: once real self-play has passed
-        `agent.entropy_after` of the target, or always.
-    """
+    """Member 1: self-play together with the world model."""
 
     envs: Batch = 64
+    """Environments that random play and self-play step at once."""
     prefill_steps: Positive = 256_000
+    """Environment steps of random play before anything is learned (the paper's K episodes)."""
     prefill_interact: Fraction = 0.3
+    """Probability of `interact` in random play; 0: all actions alike."""
     pretrain_updates: Positive = 1500
+    """World-model updates on random play alone, before self-play begins."""
     steps_per_iteration: Positive = 100
+    """Steps of each environment in a round (the paper's update interval)."""
     model_updates: Positive = 25
+    """World-model updates in a round (the paper's C)."""
     agent_updates: Positive = 5
+    """Updates of actor and critic in a round."""
     event_starts: Literal["playing", "always"] = "playing"
+    """Imagination starts in windows drawn for an event: once self-play plays, or always."""
     recent_fraction: Fraction = 0.5
+    """Share of a model batch that is drawn from the `recent_rows` latest steps."""
     recent_rows: Positive = 50_000
+    """Latest steps of B_SP that count as recent."""
     max_steps: Positive = 680_000
+    """Environment steps, random play included, that end phase 1."""
     restart_after: NonNegative = 0
+    """Environment steps after which actor and critics start again, once."""
     restart_updates: NonNegative = 0
+    """Updates of the fresh actor and critics before they play; 0: no such restart."""
     check_every: Positive = 5
+    """Rounds between two reports on the world model's predictions."""
     target_score: Number = 10.5
+    """Mean self-play score of the latest episodes that ends phase 1 earlier."""
     patience: Positive = 1000
+    """Rounds without a better mean score that end phase 1 earlier."""
 
 
 class Phase2Config(Schema):
     """Members 2..M: mostly imagination, few real episodes."""
 
     first_updates: Positive = 100
+    """Updates of actor and critics before a member's first real episodes."""
     updates_per_round: Positive = 60
+    """Updates of actor and critics before each further round of real episodes."""
     model_updates: NonNegative = 300
+    """World-model updates in each round after the first."""
     model_lr: Rate = 1e-3
+    """Adam's step size of the world model in phase 2."""
     episodes_sp: Batch = 8
+    """Real self-play episodes in a round."""
     episodes_xp: Batch = 8
+    """Real cross-play episodes in a round, over all partners; at least one in each seating with each."""
     rounds: Positive = 8
-    max_rounds: Positive = 9  # for a member whose best self-play is below the target
+    """Rounds of real episodes of each member."""
+    max_rounds: Positive = 9
+    """Rounds of a member whose best self-play score stays below `target_score`."""
     target_score: Number = 8.0
-    max_steps: Positive | None = None  # SP and XP training steps of one member; whichever of the two ends first
+    """Self-play score below which a member gets further rounds, up to `max_rounds`."""
+    max_steps: Positive | None = None
+    """Environment steps, SP and XP, of each member, if they end before its rounds; null: no such bound."""
     cache: Positive = 8192
+    """States from which one round's imagination starts, before those of the member's own data."""
     starts_random: Fraction = 0.6
+    """Share of the kept starts in states of random play."""
     starts_event: Fraction = 0.2
+    """Share of the kept starts shortly before a major event, such as a delivery."""
     starts_new: Fraction = 0.5
+    """Share of imagination that starts in a member's own data, after its first round."""
     event_reach: Positive = 10
+    """Steps before a major event within which such a start lies."""
     new_fraction: Fraction = 0.5
+    """Share of a model batch from a member's own data, half self-play, half cross-play."""
 
     @model_validator(mode="after")
     def _shares_of_starts(self) -> Phase2Config:
@@ -224,11 +313,17 @@ class XpmWmRun(RunConfig):
     """A run of XPM-WM."""
 
     method: Literal["xpm_wm"] = "xpm_wm"
+    """Cross-play minimisation in a learned world model."""
     world_model: WorldModelConfig = WorldModelConfig()
+    """The two-player world model."""
     agent: AgentConfig = AgentConfig()
+    """Actor, critics and objective."""
     replay: ReplayConfig = ReplayConfig()
+    """The buffers B_SP and B_XP."""
     phase1: Phase1Config = Phase1Config()
+    """Member 1, together with the world model."""
     phase2: Phase2Config = Phase2Config()
+    """Later members, mostly in imagination."""
 
     @model_validator(mode="after")
     def _check_windows(self) -> XpmWmRun:
