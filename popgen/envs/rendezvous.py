@@ -45,6 +45,7 @@ RULES = (
     "start_distance",
     "start_noise",
     "horizon",
+    "ending",
     "distance",
     "exit_penalty",
     "exit_reward",
@@ -77,7 +78,10 @@ class RendezvousEnv(BatchedEnv):
         landmark_distance: the landmarks stand at (+-this, +-this), inside the bounds.
         start_distance: player 0 starts at (this, 0), player 1 at (-this, 0), at rest: LIPO's `easy` start.
         start_noise: half side of the square, around each start, from which the start is drawn; 0 as in LIPO.
-        horizon: steps after which an episode is truncated.
+        horizon: steps after which an episode ends.
+        ending: what the horizon is. `terminal`: the task itself ends there, as the paper's return is a sum over the
+            horizon's steps, the features show how much of it is over and an exit costs no step beyond it. `truncated`:
+            the episode is cut, and a critic adds what it expects of steps that are never played.
         distance: `full` or `centroid`, see the module.
         exit_penalty: `absorbing` charges a leaver's team `exit_reward` for each step that the episode still had,
             added, undiscounted, to the reward of the last step; `none` ends the episode without it. Rewards are
@@ -104,6 +108,7 @@ class RendezvousEnv(BatchedEnv):
         start_distance: float = 0.3,
         start_noise: float = 0.0,
         horizon: int = 50,
+        ending: str = "terminal",
         distance: str = "full",
         exit_penalty: str = "absorbing",
         exit_reward: float | None = None,
@@ -118,6 +123,7 @@ class RendezvousEnv(BatchedEnv):
         self.start_distance = _check_number("start_distance", start_distance, 0.0, self.bounds)
         self.start_noise = _check_number("start_noise", start_noise, 0.0, self.bounds - self.start_distance)
         self.horizon = _check_integer("horizon", horizon, 1, 1_000_000)
+        self.ending = _check_choice("ending", ending, ("terminal", "truncated"))
         self.distance = _check_choice("distance", distance, ("full", "centroid"))
         self.exit_penalty = _check_choice("exit_penalty", exit_penalty, ("absorbing", "none"))
         self.integration = _check_choice("integration", integration, ("velocity_first", "position_first"))
@@ -181,15 +187,16 @@ class RendezvousEnv(BatchedEnv):
     def _find_outcome(self, position: np.ndarray, time: np.ndarray) -> StepBatch:
         """What it gives to arrive at `position` (..., P, 2) at `time` (...)."""
         left = (np.abs(position) > self.bounds).any(axis=-1)
-        terminated = left.any(axis=-1)
-        penalty = np.where(terminated, np.maximum(self.horizon - time, 0.0) * self.exit_reward, 0.0)
+        exited, over = left.any(axis=-1), time >= self.horizon
+        terminated = exited | over if self.ending == "terminal" else exited
+        penalty = np.where(exited, np.maximum(self.horizon - time, 0.0) * self.exit_reward, 0.0)
         reward = np.asarray(reward_positions(position, self.landmarks, self.distance) + penalty, dtype=np.float32)
         return StepBatch(
             reward=reward,
             score=reward.copy(),
             events=left[..., None].astype(np.uint8),
             terminated=terminated,
-            truncated=(time >= self.horizon) & ~terminated,
+            truncated=over & ~terminated,
         )
 
     def get_state(self, indices: np.ndarray | None = None) -> np.ndarray:

@@ -191,7 +191,7 @@ def measure_sabotage(
         seed=seed,
         steps=played.steps,
         exits=exits,
-        ended=played.terminated.reshape(shape),
+        ended=(played.length < env.spec.horizon).reshape(shape),
         scores=played.score.reshape(shape),
         landmarks=_count_landmarks(env, recorder, played, shape),
         paths=_first_paths(env, recorder, exits, shape),
@@ -232,7 +232,7 @@ def _count_landmarks(
     between = np.linalg.norm(env.landmarks[:, None] - env.landmarks[None], axis=-1)
     reach = between[~np.eye(len(between), dtype=bool)].min() / 4
     near = np.linalg.norm(last[:, None] - env.landmarks[None], axis=-1) < reach  # (B, K)
-    near &= ~played.terminated[:, None]
+    near &= (played.length == env.spec.horizon)[:, None]
     members = np.arange(shape[0])
     return near.reshape(*shape, -1)[members, members].sum(axis=1)
 

@@ -49,7 +49,7 @@ class Episodes:
         events: (N, P, E) int64, how often each player caused each event.
         shaped: (N, P) float64, the events weighted by `EnvSpec.event_weights`, per seat.
         length: (N,) int64, steps of the episode.
-        terminated: (N,) bool, the task ended before the horizon.
+        terminated: (N,) bool, the task itself ended, early or with a horizon that is its end.
         steps: environment steps taken in all, those of rows that waited for longer episodes included.
     """
 

@@ -56,7 +56,7 @@ def state_of(first, second, time=0):
 
 def test_equal_to_scalar_formula_on_25_600_steps():
     envs, steps = 64, 400
-    env = RendezvousEnv("mppmr", envs, seed=3, start_noise=0.5)
+    env = RendezvousEnv("mppmr", envs, seed=3, start_noise=0.5, ending="truncated")
     rows = [list(row) for row in env.get_state()]
     exits = truncations = 0
     for joint in drifting_actions(np.random.default_rng(7), steps, envs):
@@ -191,12 +191,24 @@ def test_leaving_at_the_last_step_is_terminal_and_free():
     assert batch.reward[0] > -4.4
 
 
-def test_horizon_truncates():
-    env = RendezvousEnv(num_envs=3, horizon=4)
+@pytest.mark.parametrize("ending", ["terminal", "truncated"])
+def test_the_horizon_is_a_true_end_or_a_cut(ending):
+    env = RendezvousEnv(num_envs=3, horizon=4, ending=ending)
     env.set_time(np.array([0, 2, 3]))
-    flags = [env.step(np.zeros((3, 2), dtype=np.uint8)).truncated.tolist() for _ in range(2)]
-    assert flags == [[False, False, True], [False, True, True]]
+    batches = [env.step(np.zeros((3, 2), dtype=np.uint8)) for _ in range(2)]
+    over = [[False, False, True], [False, True, True]]
+    none = [[False] * 3] * 2
+    assert [batch.terminated.tolist() for batch in batches] == (over if ending == "terminal" else none)
+    assert [batch.truncated.tolist() for batch in batches] == (none if ending == "terminal" else over)
     assert env.time(env.get_state()).tolist() == [2, 4, 5]
+    still = 1 - 0.75 * 2**0.5 - 0.6
+    assert batches[1].reward == pytest.approx([still] * 3, abs=1e-6)  # the horizon itself costs nothing
+
+
+def test_rules_that_differ_in_the_ending_are_different_rules():
+    assert RendezvousEnv().spec.fingerprint != RendezvousEnv(ending="truncated").spec.fingerprint
+    with pytest.raises(UserError, match="ending"):
+        RendezvousEnv(ending="open")
 
 
 @pytest.mark.parametrize("distance", ["full", "centroid"])

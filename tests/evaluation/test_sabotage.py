@@ -103,6 +103,13 @@ def test_only_a_leavers_own_exits_count_and_only_beside_earlier_members(trio: Sa
     assert trio.average == pytest.approx(1.25 / 3) and trio.average_ended_early == pytest.approx(1.75 / 3)
 
 
+@pytest.mark.parametrize("ending", ["terminal", "truncated"])
+def test_an_episode_that_runs_to_the_horizon_did_not_end_early(ending: str) -> None:
+    result = measured(always(STAY), always(STAY), always(RIGHT), ending=ending)
+    assert not result.ended[:2, :2].any() and result.ended[2].all()
+    assert (result.ended_early(2), result.ended_early(3)) == (0.0, 1.0)
+
+
 def test_both_leave_in_the_same_step() -> None:
     result = measured(always(STAY), always(RIGHT, LEFT), always(RIGHT, LEFT))
     assert result.exits[1, 2].all() and result.self_sabotage(3) == 1.0

@@ -125,8 +125,9 @@ class Simulator:
             valid[t], terminated[t] = ~resting, terminated[t] | resting
             cut[t] = (result.truncated | (age >= limit)) & ~terminated[t]
             ends.append(states[cut[t]])
-            # A column whose task terminated rests for what its trajectory had left: each start weighs the same.
-            resting[columns.sp :] = (terminated[t] & (age < limit))[columns.sp :]
+            # A column whose task ended early rests for what its trajectory had left: each start weighs the same.
+            early = terminated[t] & (self.env.time(states) < spec.horizon) | resting
+            resting[columns.sp :] = (early & (age < limit))[columns.sp :]
             if t == time - 1:
                 obs[time] = self.env.encode(states)
             if (over := np.flatnonzero((cut[t] | terminated[t]) & ~resting)).size:

@@ -101,6 +101,19 @@ def test_cross_play_and_restarts_rest_after_leaving_so_that_each_start_weighs_th
     assert not batch.cut[:, 1:].any()
 
 
+def test_a_column_whose_time_is_over_starts_anew_and_has_no_value_beyond() -> None:
+    env = make_env("rendezvous/mppmr", 2)
+    config = XpmSimConfig(horizon=50, unroll=50, restart_horizon=25, xp_horizon=50, xp_initial=1.0)
+    starts = StartStates(config, env, 2, 0)
+    late = env.get_state()
+    late[:, 8] = 40.0  # ten steps before the horizon
+    starts.cross_play = lambda count, partner: np.repeat(late[:1], count, 0)  # type: ignore[method-assign]
+    batch = Simulator(config, starts, 0).run(BatchColumns(1, 0, 1), always(0, 5), Partner(1, always(0, 5)))
+    assert np.flatnonzero(batch.terminated[:, 1]).tolist() == [9, 19, 29, 39, 49]
+    assert batch.valid[:, 1].all() and not batch.cut.any()
+    assert np.flatnonzero(batch.terminated[:, 0]).tolist() == [49]
+
+
 def test_the_partner_sits_in_the_other_seat_of_cross_play_only() -> None:
     batch, _ = simulate(kitchen(), BatchColumns(3, 2, 4), own=5)
     assert (batch.actions[:, :5] == 5).all()
