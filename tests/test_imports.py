@@ -20,6 +20,7 @@ ORDER = (
     "evaluation",
     "runs",
     "reports",
+    "pages",
     "actors",
     "pipelines",
     *("conf", "cli", "__main__"),

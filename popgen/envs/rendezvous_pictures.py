@@ -20,13 +20,16 @@ def draw_map(players: np.ndarray, landmarks: np.ndarray, bounds: float, figures:
 
 
 def draw_picture(players: np.ndarray, landmarks: np.ndarray, bounds: float) -> np.ndarray:
-    """(256, 256, 3) uint8: blue landmarks, a red player 0 and a green player 1, y upwards."""
+    """(256, 256, 3) uint8, y upwards: grey landmarks, a blue player 0, a smaller vermilion player 1 with a dot.
+
+    The two differ in brightness, size and shape, not in hue alone.
+    """
     size, edge = 256, 16
     picture = canvas(size, size, (90, 90, 90))
     rectangle(picture, edge, edge, size - 2 * edge, size - 2 * edge, (250, 250, 250))
     pixels = (size - 2 * edge) / (2.0 * bounds)
-    marks = [(point, 10, (90, 130, 220)) for point in landmarks]
-    marks += [(players[0], 7, (215, 60, 50)), (players[1], 5, (50, 165, 80))]
+    marks = [(point, 10, (160, 160, 160)) for point in landmarks]
+    marks += [(players[0], 8, (0, 114, 178)), (players[1], 6, (213, 94, 0)), (players[1], 2, (255, 255, 255))]
     for (x, y), radius, colour in marks:
         disc(picture, size / 2 - y * pixels, size / 2 + x * pixels, radius, colour)
     return picture

@@ -365,6 +365,7 @@ def test_pictures_show_both_players_and_the_landmarks():
     picture = env.render_rgb(0)
     assert picture.shape == (256, 256, 3) and picture.dtype == np.uint8
     middle, offset = 128, 0.3 * 224 / 3
-    assert tuple(picture[middle, round(middle + offset)]) == (215, 60, 50)
-    assert tuple(picture[middle, round(middle - offset)]) == (50, 165, 80)
-    assert tuple(picture[middle - 56, middle + 56]) == (90, 130, 220)
+    assert tuple(picture[middle, round(middle + offset)]) == (0, 114, 178)
+    assert tuple(picture[middle, round(middle - offset)]) == (255, 255, 255)
+    assert tuple(picture[middle, round(middle - offset) - 4]) == (213, 94, 0)
+    assert tuple(picture[middle - 56, middle + 56]) == (160, 160, 160)

@@ -1,6 +1,12 @@
-"""Kitchens as text and as pictures, drawn from a state row."""
+"""Kitchens as text and as pictures, drawn from a state row.
+
+Nothing in a picture is told by its hue alone: players carry their numbers, ingredients differ in brightness and shape,
+a pot that cooks shows the steps left and one that is ready a tick.
+"""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,12 +18,19 @@ from popgen.envs.overcooked.rules import SOUPS
 TILE = 32
 ARROWS = "↑↓→←"
 COLOURS = {
-    "floor": (236, 226, 208), "X": (164, 124, 84), "O": (150, 110, 70), "T": (150, 110, 70), "D": (150, 110, 70),
-    "P": (96, 96, 104), "S": (120, 168, 120), "onion": (240, 208, 80), "tomato": (208, 56, 48), "dish": (248, 248, 248),
-    "pot": (40, 40, 44), "broth": (120, 84, 56), "edge": (120, 90, 60), "skin": (248, 212, 176), "dark": (32, 32, 32),
-    "ready": (72, 200, 88), "cooking": (248, 152, 40),
+    "floor": (238, 230, 214), "X": (168, 132, 92), "O": (138, 102, 66), "T": (138, 102, 66), "D": (138, 102, 66),
+    "P": (96, 96, 104), "S": (0, 122, 94), "onion": (250, 220, 90), "tomato": (178, 34, 30), "dish": (250, 250, 250),
+    "leaf": (20, 60, 30), "pot": (36, 36, 40), "broth": (112, 74, 46), "edge": (104, 76, 48), "skin": (248, 212, 176),
+    "dark": (24, 24, 24), "white": (255, 255, 255), "cooking": (230, 159, 0),
 }  # fmt: skip
-HATS = ((64, 104, 216), (56, 152, 72))
+HATS = ((0, 114, 178), (213, 94, 0))
+"""Of player 1 (seat 0) and player 2 (seat 1): blue and vermilion of Okabe and Ito's palette."""
+
+GLYPHS = {
+    "0": "75557", "1": "26227", "2": "71747", "3": "71717", "4": "55711",
+    "5": "74717", "6": "74757", "7": "71122", "8": "75757", "9": "75717",
+}  # fmt: skip
+"""Rows of three pixels, each row an octal digit whose bits are the pixels from the left."""
 
 
 def _spell_object(code: int) -> str:
@@ -74,19 +87,18 @@ def as_text(kitchen: Kitchen, row: np.ndarray) -> str:
 def as_rgb(kitchen: Kitchen, row: np.ndarray) -> np.ndarray:
     """(H * 32, W * 32, 3) uint8 picture."""
     layout = kitchen.layout
-    picture = np.zeros((layout.height * TILE, layout.width * TILE, 3), np.uint8)
+    picture = np.empty((layout.height * TILE, layout.width * TILE, 3), np.uint8)
     for y in range(layout.height):
         for x in range(layout.width):
-            _draw_tile(_cut_tile(picture, (x, y)), layout.tile((x, y)))
+            _cut_tile(picture, (x, y))[:] = _paint_ground(layout.tile((x, y)))
     for cell, (code, cooking) in _list_contents(kitchen, row).items():
-        tile = _cut_tile(picture, cell)
         if layout.tile(cell) == "P":
-            _draw_pot(tile, code, cooking)
+            _cut_tile(picture, cell)[:] = _paint_pot(code, cooking)
         elif code:
-            _draw_item(tile, code, 16, 16)
+            _draw_item(_cut_tile(picture, cell), code, 16, 16)
     for i in (0, 1):
         cell = (int(row[i]) % layout.width, int(row[i]) // layout.width)
-        _draw_player(_cut_tile(picture, cell), i, int(row[k.ORIENT + i]) & 3, int(row[k.HELD + i]))
+        _cut_tile(picture, cell)[:] = _paint_player(i, int(row[k.ORIENT + i]) & 3, int(row[k.HELD + i]))
     return picture
 
 
@@ -99,20 +111,34 @@ def _draw_disc(tile: np.ndarray, x: float, y: float, radius: float, colour: tupl
     tile[(columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2 <= radius**2] = colour
 
 
-def _draw_tile(tile: np.ndarray, mark: str) -> None:
+def _draw_number(tile: np.ndarray, number: int, x: int, y: int, colour: tuple[int, int, int], size: int = 1) -> None:
+    """Digits from the upper left corner (x, y), each pixel of a glyph `size` pixels wide and high."""
+    for place, digit in enumerate(str(number)):
+        for line, bits in enumerate(GLYPHS[digit]):
+            for column in range(3):
+                if int(bits) >> (2 - column) & 1:
+                    top, left = y + line * size, x + (4 * place + column) * size
+                    tile[top : top + size, left : left + size] = colour
+
+
+@lru_cache(maxsize=16)
+def _paint_ground(mark: str) -> np.ndarray:
+    """A tile (32, 32, 3) with nobody and nothing on it."""
+    tile = np.empty((TILE, TILE, 3), np.uint8)
     tile[:] = COLOURS["floor" if mark == " " else mark]
     if mark == " ":
-        tile[0], tile[:, 0] = (220, 208, 188), (220, 208, 188)
-        return
+        tile[0], tile[:, 0] = (220, 210, 192), (220, 210, 192)
+        return tile
     tile[[0, -1]], tile[:, [0, -1]] = COLOURS["edge"], COLOURS["edge"]
     if mark in "OTD":
-        colour = COLOURS[{"O": "onion", "T": "tomato", "D": "dish"}[mark]]
-        for x, y in ((11, 20), (21, 20), (16, 11)):
-            _draw_disc(tile, x, y, 6, COLOURS["dark"])
-            _draw_disc(tile, x, y, 5, colour)
-    elif mark == "S":
-        tile[12:20, 4:28] = (200, 224, 200)
-        tile[6:26, 14:18] = (200, 224, 200)
+        code = {"O": k.ONION, "T": k.TOMATO, "D": k.DISH}[mark]
+        for x, y in ((10, 21), (22, 21), (16, 11)):
+            _draw_item(tile, code, x, y, small=True)
+    elif mark == "S":  # an arrow upwards: out of the kitchen
+        for line in range(8):
+            tile[6 + line, 15 - line : 17 + line] = COLOURS["white"]
+        tile[14:26, 13:19] = COLOURS["white"]
+    return tile
 
 
 def _draw_soup(tile: np.ndarray, code: int, x: float, y: float, radius: float) -> None:
@@ -121,42 +147,64 @@ def _draw_soup(tile: np.ndarray, code: int, x: float, y: float, radius: float) -
     onions, tomatoes = SOUPS[code - k.FIRST_SOUP]
     for i, name in enumerate(["onion"] * onions + ["tomato"] * tomatoes):
         angle = 2.1 * i - 1.57
-        _draw_disc(
-            tile, x + radius * 0.5 * np.cos(angle), y + radius * 0.5 * np.sin(angle), radius * 0.35, COLOURS[name]
-        )
+        where = x + radius * 0.5 * np.cos(angle), y + radius * 0.5 * np.sin(angle)
+        _draw_disc(tile, *where, radius * 0.35, COLOURS[name])
 
 
-def _draw_pot(tile: np.ndarray, code: int, cooking: int) -> None:
-    _draw_disc(tile, 16, 15, 12, COLOURS["pot"])
+@lru_cache(maxsize=4096)
+def _paint_pot(code: int, cooking: int) -> np.ndarray:
+    """A pot (32, 32, 3): what is in it, the steps left and a bar that grows, or a tick when the soup is ready."""
+    tile = _paint_ground("P").copy()
+    _draw_disc(tile, 16, 14, 12, COLOURS["pot"])
     if not code:
-        return
-    _draw_soup(tile, code, 16, 15, 9)
+        return tile
+    _draw_soup(tile, code, 16, 14, 9)
     if cooking == 1:
-        tile[28:31, 3:29] = COLOURS["ready"]
+        tile[27:31, 2:30] = COLOURS["white"]
+        for step in range(11):  # a tick: down to the right, then up
+            y = 12 + step if step < 4 else 18 - step
+            tile[y : y + 4, 11 + step] = COLOURS["white"]
+            tile[y + 4, 11 + step] = COLOURS["dark"]
     elif cooking > 1:
-        tile[28:31, 3:29] = COLOURS["dark"]
-        tile[28:31, 3 : 3 + max(1, 26 - cooking + 1)] = COLOURS["cooking"]
+        tile[27:31, 2:30] = COLOURS["dark"]
+        tile[27:31, 2 : 2 + max(1, 28 - cooking + 1)] = COLOURS["cooking"]
+        tile[1:13, 1 : 2 + 8 * len(str(cooking - 1))] = COLOURS["dark"]
+        _draw_number(tile, cooking - 1, 2, 2, COLOURS["white"], 2)
+    return tile
 
 
-def _draw_item(tile: np.ndarray, code: int, x: float, y: float) -> None:
+def _draw_item(tile: np.ndarray, code: int, x: float, y: float, *, small: bool = False) -> None:
     if code in (k.ONION, k.TOMATO):
-        _draw_disc(tile, x, y, 6, COLOURS["dark"])
-        _draw_disc(tile, x, y, 5, COLOURS["onion" if code == k.ONION else "tomato"])
+        _draw_disc(tile, x, y, 5 if small else 6, COLOURS["dark"])
+        _draw_disc(tile, x, y, 4 if small else 5, COLOURS["onion" if code == k.ONION else "tomato"])
+        left, top = round(x), round(y)
+        if code == k.ONION:  # rings
+            for column in (left - 2, left + 1):
+                tile[max(top - 2, 0) : top + 3, column] = (196, 150, 40)
+        else:  # leaves
+            tile[max(top - 4, 0) : max(top - 2, 0), left - 2 : left + 2] = COLOURS["white"]
+            tile[max(top - 5, 0) : max(top - 3, 0), left - 1 : left + 1] = COLOURS["leaf"]
         return
-    _draw_disc(tile, x, y, 8, COLOURS["dark"])
-    _draw_disc(tile, x, y, 7, COLOURS["dish"])
+    _draw_disc(tile, x, y, 6 if small else 8, COLOURS["dark"])
+    _draw_disc(tile, x, y, 5 if small else 7, COLOURS["dish"])
     if code == k.DISH:
-        _draw_disc(tile, x, y, 4, (216, 216, 216))
+        _draw_disc(tile, x, y, 3 if small else 4, (206, 206, 206))
     else:
         _draw_soup(tile, code, x, y, 5.5)
 
 
-def _draw_player(tile: np.ndarray, index: int, side: int, held: int) -> None:
-    """A head under a coloured hat; the nose, and what is held, point where the player faces."""
+@lru_cache(maxsize=1024)
+def _paint_player(index: int, side: int, held: int) -> np.ndarray:
+    """A head (32, 32, 3) under a numbered hat; the nose, and what is held, point where the player faces."""
+    tile = _paint_ground(" ").copy()
     dx, dy = DIRECTIONS[side]
-    _draw_disc(tile, 16, 16, 11, COLOURS["dark"])
-    _draw_disc(tile, 16, 16, 10, COLOURS["skin"])
-    _draw_disc(tile, 16 - 3 * dx, 16 - 3 * dy, 8, HATS[index])
-    _draw_disc(tile, 16 + 10 * dx, 16 + 10 * dy, 3, COLOURS["dark"])
+    _draw_disc(tile, 16, 16, 12, COLOURS["dark"])
+    _draw_disc(tile, 16, 16, 11, COLOURS["skin"])
+    x, y = 16 - 4 * dx, 16 - 4 * dy
+    _draw_disc(tile, x, y, 9, COLOURS["white"])
+    _draw_disc(tile, x, y, 8, HATS[index])
+    _draw_number(tile, index + 1, x - 3, y - 5, COLOURS["white"], 2)
+    _draw_disc(tile, 16 + 11 * dx, 16 + 11 * dy, 3, COLOURS["dark"])
     if held:
-        _draw_item(tile, held, 16 + 7 * dx, 16 + 7 * dy)
+        _draw_item(tile, held, 16 + 8 * dx, 16 + 8 * dy)
+    return tile
