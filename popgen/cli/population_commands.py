@@ -1,36 +1,17 @@
-"""`popgen evaluate`, `show` and `runs`: what is there already."""
+"""`popgen show` and `runs`: what is there already."""
 
 from __future__ import annotations
 
 import argparse
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from popgen.cli.arguments import add_command, at_least, numbers, pair
-from popgen.cli.printing import OK, print_json, print_report, print_table, short
-from popgen.cli.training import bound_threads
+from popgen.cli.arguments import add_command
+from popgen.cli.printing import OK, print_json, print_table, short
 
 
 def add(commands: Any) -> None:
-    """`evaluate`, `show` and `runs`."""
-    parser = add_command(
-        commands,
-        "evaluate",
-        evaluate,
-        "SP/XP matrix of a population, beside random and idle partners",
-        "Keys of --json: those of popgen/reports/crossplay_report.py (sp, xp, matrix, beside, obstruction, pairs, ...) "
-        "and files.",
-    )
-    parser.add_argument("population", metavar="POPULATION", help="folder that holds manifest.json")
-    parser.add_argument("--episodes", type=at_least(1), default=20, help="per ordered pair (%(default)s)")
-    parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation (%(default)s)")
-    parser.add_argument("--members", type=numbers, default=None, metavar="1,2,...", help="all by default")
-    parser.add_argument("--out", metavar="DIR", help="of the report (POPULATION/evaluation)")
-    parser.add_argument("--env", metavar="NAME", help="refuse a population that was trained in another environment")
-    parser.add_argument(
-        "--param", type=pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
-    )
+    """`show` and `runs`."""
     parser = add_command(
         commands,
         "show",
@@ -50,44 +31,6 @@ def add(commands: Any) -> None:
         "steps (by kind), total_steps, seconds (of all attempts), attempt, began (seconds since 1970), error.",
     )
     parser.add_argument("root", metavar="ROOT", nargs="?", default="runs", help="folder of the runs (%(default)s)")
-
-
-def evaluate(args: argparse.Namespace) -> int:
-    """Play all pairs of members and write the report."""
-    bound_threads(1)
-    from popgen.population import check_compatible, load_population
-    from popgen.progress import make_reporter
-    from popgen.runs.preflight import check_root
-
-    population = load_population(args.population)
-    if args.env or args.param:
-        from popgen.envs import make_env
-
-        info = population.env_info
-        name = args.env or info.name
-        params = {**(info.params if name == info.name else {}), **dict(args.param)}
-        check_compatible(population, make_env(name, 1, **params).spec)
-    out = Path(args.out) if args.out else Path(args.population) / "evaluation"
-    check_root(out, 16 * 2**20, "--out")
-    from popgen.evaluation.crossplay import evaluate_population
-    from popgen.reports.crossplay_report import matrix_sheet, summary, to_dict, write_report
-
-    with closing(make_reporter(quiet=args.quiet)) as reporter:
-        reporter.phase("evaluation", 1)
-        result = evaluate_population(
-            population,
-            args.episodes,
-            args.seed,
-            args.members,
-            progress=lambda done, total: reporter.update(done / total, episodes=done),
-        )
-    files, report = write_report(result, out), to_dict(result)
-    if args.json:
-        print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
-        return OK
-    table = matrix_sheet(report, narrow=True).to_rich()
-    print_report([table], summary(report), str(out), [path.name for path in files.values()])
-    return OK
 
 
 def show(args: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping
+from textwrap import wrap
 from typing import Any
 
 from popgen.jsonable import jsonable
@@ -22,16 +23,19 @@ def print_json(value: Mapping[str, Any]) -> None:
     print(json.dumps(jsonable(value), allow_nan=False))
 
 
-def print_table(table: Any) -> None:
-    """One of rich's."""
+def print_table(table: Any, width: int | None = None) -> None:
+    """One of rich's, `width` columns wide: by default the terminal's."""
     from rich.console import Console
 
     # Piped output has no width of its own; tables of many members must not be cut.
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+    Console(width=width or (None if sys.stdout.isatty() else 200)).print(table)
 
 
-def print_report(tables: Iterable[Any], lines: Iterable[str], out: str, files: Iterable[str]) -> None:
+def print_report(
+    tables: Iterable[Any], lines: Iterable[str], out: str, files: Iterable[str], width: int | None = None
+) -> None:
     """Tables, sentences, and where the report's files are."""
     for table in tables:
-        print_table(table)
-    print("\n".join([*lines, f"report: {out} ({', '.join(files)})"]))
+        print_table(table, width)
+    told = [part for line in lines for part in (wrap(line, width) if width else [line])]
+    print("\n".join([*told, f"report: {out} ({', '.join(files)})"]))

@@ -438,3 +438,29 @@ def test_bench_env(env: str, run: Run) -> None:
     else:
         assert reference is None and result["ratio"] is None
     assert run("bench", "env", "--env", env, "--envs", "16", "--seconds", "0.05")[1].startswith(f"{env}: ")
+
+
+def test_evaluate_egos_beside_hold_outs(run: Run, random_population: Path, tmp_path: Path) -> None:
+    """A population on the left, another one and an agent of the user's on the right."""
+    other = tmp_path / "other"
+    shutil.copytree(random_population, other)
+    manifest = json.loads((other / "manifest.json").read_text())
+    (other / "manifest.json").write_text(json.dumps(manifest | {"seed": 5}))
+    words = ("--with", f"held={other}", "popgen.policies.simple_policies:RandomPolicy", "--episodes", "1")
+    code, out, err = run("evaluate", f"ego={random_population}", *words, "--out", "report", "--quiet")
+    # RandomPolicy wants a number of actions, not a spec: an error of the agent's own is told in one line.
+    refused((code, out, err), "cannot be made")
+    (tmp_path / "agents_of_a_user.py").write_text(
+        "import numpy as np\nclass North:\n    view = 'features'\n    def reset(self, batch, seed): pass\n"
+        "    def act(self, obs, previous, first): return np.zeros(obs.shape[:2], np.uint8)\n"
+    )
+    words = ("--with", f"held={other}", "agents_of_a_user:North", "--episodes", "1", "--out", "report")
+    code, out, err = run("evaluate", f"ego={random_population}", *words, "--quiet")
+    assert (code, err) == (0, "") and "all hold-outs" in out and "North" in out
+    assert all(len(line) <= 80 for line in out.splitlines()[:-1])
+    names = {f"holdout.{suffix}" for suffix in ("json", "csv", "md", "png", "svg")}
+    assert {path.name for path in Path("report").iterdir()} == names
+    refused(run("evaluate", str(random_population), "--with", str(random_population)), "which the ego")
+    refused(run("evaluate", str(random_population), str(other)), "give one population")
+    refused(run("evaluate", str(random_population), "--control", "x"), "evaluation with --with")
+    refused(run("evaluate", str(random_population), "--with", str(other), "--members", "1"), "without --with")

@@ -1,0 +1,164 @@
+"""`popgen evaluate`: the SP/XP matrix of a population, or egos beside hold-out partners."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from popgen.cli.arguments import add_command, at_least, named_path, numbers, pair
+from popgen.cli.printing import OK, print_json, print_report
+from popgen.cli.training import bound_threads
+from popgen.errors import UserError
+
+if TYPE_CHECKING:
+    from popgen.evaluation.holdout import Casting
+    from popgen.population.manifest import EnvironmentInfo
+
+MATRIX_EPISODES, HOLDOUT_EPISODES = 20, 40
+"""Defaults: for each ordered pair of members; for each ego, partner and seat."""
+
+_MATRIX_ONLY = ("members", "env", "param")
+_HOLDOUT_ONLY = ("human", "control")
+_NAMED = "[NAME=]POPULATION"
+
+
+def add(commands: Any) -> None:
+    """`evaluate`."""
+    parser = add_command(
+        commands,
+        "evaluate",
+        evaluate,
+        "SP/XP matrix of a population, or egos beside hold-out partners (--with)",
+        "Keys of --json: files, and those of popgen/reports/crossplay_report.py (sp, xp, matrix, beside, obstruction, "
+        "pairs, ...) or, with --with, of popgen/reports/holdout_report.py (standings, controls, margins, pairs, ...).",
+    )
+    parser.add_argument(
+        *("populations",),
+        metavar=_NAMED,
+        nargs="+",
+        type=named_path,
+        help="folder that holds manifest.json; with --with also module:Agent, and one NAME for several seeds of an ego",
+    )
+    parser.add_argument(
+        *("--with",),
+        dest="partners",
+        metavar=_NAMED,
+        nargs="+",
+        action="extend",
+        type=named_path,
+        help="hold-out partners: populations, or agents as module:Agent",
+    )
+    parser.add_argument(
+        "--human", metavar=_NAMED, nargs="+", action="extend", type=named_path, help="human proxies as partners"
+    )
+    parser.add_argument("--control", metavar="NAME", help="an ego over which the others' margins are told")
+    told = f"per ordered pair ({MATRIX_EPISODES}), or per ego, partner and seat ({HOLDOUT_EPISODES})"
+    parser.add_argument("--episodes", type=at_least(1), default=None, help=told)
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation (%(default)s)")
+    parser.add_argument("--members", type=numbers, default=None, metavar="1,2,...", help="all by default")
+    parser.add_argument("--out", metavar="DIR", help="of the report (POPULATION/evaluation, with --with: holdout)")
+    parser.add_argument("--env", metavar="NAME", help="refuse a population that was trained in another environment")
+    parser.add_argument(
+        "--param", type=pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
+    )
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Play, and write the report."""
+    bound_threads(1)
+    together = args.partners or args.human
+    for name in _MATRIX_ONLY if together else _HOLDOUT_ONLY:
+        if getattr(args, name):
+            without = "without" if together else "with"
+            raise UserError(f"--{name}", f"is of an evaluation {without} --with", "leave it out")
+    if together:
+        return _evaluate_egos(args)
+    if len(args.populations) > 1:
+        raise UserError("arguments", "give one population, or hold-out partners by --with", "see popgen evaluate -h")
+    return _evaluate_matrix(args, args.populations[0][1])
+
+
+def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
+    from popgen.population import check_compatible, load_population
+    from popgen.progress import make_reporter
+    from popgen.runs.preflight import check_root
+
+    population = load_population(path)
+    if args.env or args.param:
+        from popgen.envs import make_env
+
+        info = population.env_info
+        name = args.env or info.name
+        params = {**(info.params if name == info.name else {}), **dict(args.param)}
+        check_compatible(population, make_env(name, 1, **params).spec)
+    out = Path(args.out) if args.out else Path(path) / "evaluation"
+    check_root(out, 16 * 2**20, "--out")
+    from popgen.evaluation.crossplay import evaluate_population
+    from popgen.reports.crossplay_report import matrix_sheet, summary, to_dict, write_report
+
+    with closing(make_reporter(quiet=args.quiet)) as reporter:
+        reporter.phase("evaluation", 1)
+        result = evaluate_population(
+            population,
+            args.episodes or MATRIX_EPISODES,
+            args.seed,
+            args.members,
+            progress=lambda done, total: reporter.update(done / total, episodes=done),
+        )
+    files, report = write_report(result, out), to_dict(result)
+    if args.json:
+        print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
+        return OK
+    table = matrix_sheet(report, narrow=True).to_rich()
+    print_report([table], summary(report), str(out), [path.name for path in files.values()])
+    return OK
+
+
+def _evaluate_egos(args: argparse.Namespace) -> int:
+    from popgen.envs import make_env
+    from popgen.evaluation.holdout import evaluate_holdout
+    from popgen.progress import make_reporter
+    from popgen.reports.holdout_report import to_dict, write_report
+    from popgen.reports.holdout_tables import list_lines, to_sheets
+    from popgen.runs.preflight import check_root
+
+    casting, environment = _cast_players(args)
+    out = Path(args.out or "holdout")
+    check_root(out, 64 * 2**20, "--out")
+    with closing(make_reporter(quiet=args.quiet)) as reporter:
+        reporter.phase("evaluation", 1)
+        result = evaluate_holdout(
+            casting,
+            environment,
+            lambda num_envs, seed: make_env(environment.name, num_envs, seed=seed, **environment.params),
+            args.episodes or HOLDOUT_EPISODES,
+            args.seed,
+            progress=lambda done, total: reporter.update(done / total, episodes=done),
+        )
+    report = to_dict(result, args.control)
+    files = write_report(report, out)
+    if args.json:
+        print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
+        return OK
+    tables = [sheet.to_rich() for sheet in to_sheets(report)]
+    print_report(tables, list_lines(report), str(out), [path.name for path in files.values()], width=80)
+    return OK
+
+
+def _cast_players(args: argparse.Namespace) -> tuple[Casting, EnvironmentInfo]:
+    """Egos and partners with nothing in common, in one environment."""
+    from popgen.evaluation.holdout import Casting
+    from popgen.evaluation.holdout_players import check_disjoint, open_sides
+    from popgen.reports.method_titles import title_of
+
+    wanted = {"ego": args.populations, "partner": args.partners or [], "human": args.human or []}
+    opened = open_sides(wanted, title_of)
+    humans = opened.sides["human"]
+    partners = (*opened.sides["partner"], *humans)
+    check_disjoint(opened.sides["ego"], partners)
+    if args.control and args.control not in {group.label for group in opened.sides["ego"]}:
+        raise UserError("--control", f"there is no ego {args.control}", "name it as NAME=POPULATION")
+    named = frozenset(group.label for group in humans)
+    return Casting(opened.sides["ego"], partners, humans=named), opened.environment

@@ -1,0 +1,191 @@
+"""What a hold-out evaluation says of each ego, beside each kind of partner.
+
+The reference of a partner and seat is the best response known to it: the partner's play with itself, or that of the
+best response trained for it, whichever scores more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from popgen.errors import UserError
+from popgen.evaluation.holdout import SEATS, HoldoutResult
+from popgen.evaluation.holdout_metrics import (
+    Interval,
+    Spread,
+    bootstrap_interval,
+    describe_spread,
+    interquartile_mean,
+    measure_br_proximity,
+    measure_cvar,
+    measure_regret,
+    normalise_returns,
+)
+from popgen.evaluation.holdout_players import Group
+
+CVAR_SHARE = 0.25
+"""Share of the lowest pair means that the conditional value at risk averages."""
+
+REPETITIONS = 1000
+"""Of the bootstrap."""
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The lowest mean over episodes of an ego's player beside a partner.
+
+    Attributes:
+        score: that mean.
+        ego, partner: names of the players.
+        seat: of the ego.
+    """
+
+    score: float
+    ego: str
+    partner: str
+    seat: int
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Figures of one ego beside one set of partners, over its seeds, the partners and both seats.
+
+    Attributes:
+        ego, partners: labels; `partners` of a group, or of a set of groups.
+        count: partners.
+        score: mean, SD over episodes and SE of the mean (SD over the root of all episodes, as in the paper).
+        interval: of the mean: over the ego's seeds, or over partners and seats where it has one seed.
+        seats: mean by the ego's seat.
+        worst: the lowest pair.
+        cvar: mean of the lowest quarter of pair means.
+        br_prox: inter-quartile mean of BR-Prox (clipped at 1) over seeds, partners and seats, with its interval.
+        br_prox_unclipped: mean without the bound, over pairs whose reference scores above 0.
+        normalised: mean of score over the best score that anybody reached with the partner; NaN without one above 0.
+        regret: mean of what the reference scores more than the ego.
+    """
+
+    ego: str
+    partners: str
+    count: int
+    score: Spread
+    interval: Interval
+    seats: tuple[float, float]
+    worst: Worst
+    cvar: float
+    br_prox: Interval
+    br_prox_unclipped: float
+    normalised: float
+    regret: float
+
+
+@dataclass(frozen=True)
+class Margin:
+    """How much more an ego scores than a control with the same partners and seats, with its interval over these."""
+
+    ego: str
+    control: str
+    partners: str
+    gain: Interval
+
+
+@dataclass(frozen=True)
+class PartnerSet:
+    """Partners whose scores are taken together: a label and their indices among the K."""
+
+    label: str
+    columns: tuple[int, ...]
+
+
+ALL, OWN, CROSS = "all hold-outs", "own method", "other methods"
+"""Labels of sets of groups: all but people; those of the methods that taught the ego; those of other methods."""
+
+
+def find_references(result: HoldoutResult) -> np.ndarray:
+    """(K, 2) mean scores of the best response known to each partner, by the seat of the response."""
+    alone = np.repeat(result.partner_alone.mean(-1)[:, None], len(SEATS), axis=1)
+    return np.fmax(alone, result.responses.mean(-1))
+
+
+def list_sets(result: HoldoutResult, ego: Group) -> list[PartnerSet]:
+    """Each group of partners, then all hold-outs, those of the ego's own methods and those of other methods."""
+    casting = result.casting
+    held_out = [group for group in casting.partners if group.label not in casting.humans]
+    chosen = [(group.label, [group.label]) for group in casting.partners]
+    if len(held_out) > 1:
+        own = [group.label for group in held_out if group.method in ego.taught_by]
+        chosen.append((ALL, [group.label for group in held_out]))
+        if ego.taught_by:
+            chosen += [(OWN, own), (CROSS, [group.label for group in held_out if group.label not in own])]
+    sets = [PartnerSet(label, tuple(casting.columns(labels))) for label, labels in chosen]
+    return [one for one in sets if one.columns]
+
+
+def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> Standing:
+    """All figures of an ego beside a set of partners."""
+    rows, columns = result.casting.rows(ego.label), list(chosen.columns)
+    scores = result.scores[np.ix_(rows, columns)]
+    means, references = scores.mean(-1), find_references(result)[columns]
+    best = np.fmax(references, result.scores.mean(-1).max(0)[columns])
+    clipped = measure_br_proximity(means, references)
+    unclipped = measure_br_proximity(means, references, clip=False)
+    useful = best > 0.0
+    normalised = normalise_returns(means[:, useful], 0.0, best[useful]) if useful.any() else np.array([math.nan])
+    return Standing(
+        ego=ego.label,
+        partners=chosen.label,
+        count=len(columns),
+        score=describe_spread(scores),
+        interval=_bound_figure(means, np.mean),
+        seats=(float(means[..., 0].mean()), float(means[..., 1].mean())),
+        worst=_find_worst_pair(result, rows, columns),
+        cvar=measure_cvar(means, CVAR_SHARE),
+        br_prox=_bound_figure(clipped),
+        br_prox_unclipped=float(np.nanmean(unclipped)) if np.isfinite(unclipped).any() else math.nan,
+        normalised=float(normalised.mean()),
+        regret=float(measure_regret(means, references).mean()),
+    )
+
+
+def _bound_figure(values: np.ndarray, estimate: Callable[[np.ndarray], float] = interquartile_mean) -> Interval:
+    """Interval of a figure of (runs, K, 2): over runs within each task, or over tasks where there is one run."""
+    flat = values.reshape(len(values), -1)
+    return bootstrap_interval(flat, estimate, over_tasks=len(flat) == 1, repetitions=REPETITIONS)
+
+
+def _find_worst_pair(result: HoldoutResult, rows: Sequence[int], columns: Sequence[int]) -> Worst:
+    means = result.scores[np.ix_(rows, columns)].mean(-1)
+    row, column, seat = np.unravel_index(int(means.argmin()), means.shape)
+    ego = result.casting.ego_players[rows[row]]
+    partner = result.casting.partner_players[columns[column]]
+    return Worst(float(means.min()), ego.name, partner.name, int(seat))
+
+
+def describe_all(result: HoldoutResult) -> list[Standing]:
+    """Every ego beside every set of partners."""
+    return [describe_standing(result, ego, chosen) for ego in result.casting.egos for chosen in list_sets(result, ego)]
+
+
+def measure_margins(result: HoldoutResult, control: str) -> list[Margin]:
+    """What every other ego scores more than the ego `control`, beside each group of partners and all hold-outs.
+
+    Raises:
+        UserError: there is no ego of that name.
+    """
+    egos = [group.label for group in result.casting.egos]
+    if control not in egos:
+        raise UserError("--control", f"there is no ego {control}", f"choose among {', '.join(egos)}")
+    base = result.scores[result.casting.rows(control)].mean((0, -1))
+    found = []
+    for ego in result.casting.egos:
+        if ego.label == control:
+            continue
+        gains = result.scores[result.casting.rows(ego.label)].mean((0, -1)) - base
+        for chosen in list_sets(result, ego):
+            if chosen.label not in (OWN, CROSS):
+                gain = _bound_figure(gains[list(chosen.columns)][None], np.mean)
+                found.append(Margin(ego.label, control, chosen.label, gain))
+    return found
