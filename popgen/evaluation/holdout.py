@@ -95,6 +95,8 @@ class _Programme:
     """Lists matches and hands out their scores afterwards."""
 
     def __init__(self, casting: Casting, env: BatchedEnv) -> None:
+        if not casting.egos or not casting.partners:
+            raise UserError("holdout", "needs an ego and a partner at least")
         self.policies: list[Policy] = []
         self.egos = [self._add_policy(player.make()) for player in casting.ego_players]
         self.partners = [self._add_policy(player.make()) for player in casting.partner_players]
@@ -159,8 +161,6 @@ def evaluate_holdout(
     """
     if episodes < 1:
         raise UserError("evaluation.episodes", f"must be at least 1, got {episodes}")
-    if not casting.egos or not casting.partners:
-        raise UserError("holdout", "needs an ego and a partner at least")
     programme = _Programme(casting, make(1, 0))
     played = play_teams(
         make, programme.policies, list(programme.numbers), episodes, seed=seed, max_envs=max_envs, progress=progress
