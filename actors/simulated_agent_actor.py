@@ -53,12 +53,12 @@ class SimulatedAgentActor:
         self._learner = XpmSimLearner(self.config.xpm_sim, self.env, member, seed, frozen, shared)
         return self._learner.actor.weights()
 
-    def ingest(self, segments: list[Segments], strength: dict[int, float]) -> None:
-        """Real episodes into the buffers, and each partner's latest cross-play return."""
+    def ingest(self, segments: list[Segments], strength: dict[int, float], multipliers: dict[int, float]) -> None:
+        """Real episodes into the buffers; each partner's latest cross-play return, and its multiplier."""
         for by_kind in segments:
             for part in by_kind.values():
                 self.learner.starts.add(part.result())
-        self.learner.partner_scores = dict(strength)
+        self.learner.partner_scores, self.learner.multipliers = dict(strength), dict(multipliers)
 
     def learn(self, updates: int) -> Learned:
         """Simulate and update `updates` times."""

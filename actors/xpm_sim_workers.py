@@ -40,9 +40,11 @@ class XpmSimWorkers:
         self.samplers.open(matches, policies, seed)
         return self.samplers.collect(steps)
 
-    def ingest(self, segments: list[Segments], strength: dict[int, float]) -> Pending[None]:
+    def ingest(
+        self, segments: list[Segments], strength: dict[int, float], multipliers: dict[int, float]
+    ) -> Pending[None]:
         """Segments go from the samplers' store to the learner."""
-        return self.learner.ask(SimulatedAgentActor.ingest, segments, strength)
+        return self.learner.ask(SimulatedAgentActor.ingest, segments, strength, multipliers)
 
     def learn(self, updates: int) -> Pending[Learned]:
         """The learner's."""

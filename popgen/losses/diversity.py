@@ -5,9 +5,17 @@
     J_CoMeDi(j)  = J_SP(j) + lambda_MP J_MP(j) - lambda_XP max_k J_XP(j, k)     (paper, eq. CoMeDi)
 
 A sign is applied to the advantage before any surrogate or clipping; value losses never change sign.
+
+Two further options of every such objective, ours:
+
+    a bound       cross-play's advantages count for at most `clip` spreads of self-play's
+    a constraint  maximise J_SP(j) subject to J_XP(j, k) <= limit for every k, by a multiplier m_k in [0, 1]:
+                  lambda_XP m_k stands where lambda_XP stood
 """
 
 from __future__ import annotations
+
+import math
 
 from jaxtyping import Float
 from torch import Tensor
@@ -29,3 +37,25 @@ def signed_advantage(
     if kind is Kind.XP:
         advantage = advantage - advantage.mean()
     return SIGN[kind] * weight * advantage / scale
+
+
+def bound_advantage(
+    advantage: Float[Tensor, "*rows"], *, clip: float, spread: Float[Tensor, ""] | float
+) -> Float[Tensor, "*rows"]:
+    """Cross-play's advantages, at most `clip` spreads of self-play's in size (0: as they are): so a large loss for the
+    team, such as the penalty of leaving, is no larger gain than holding to another convention."""
+    bound = spread * (clip or math.inf)
+    return advantage.clamp(-bound, bound)
+
+
+def next_multiplier(multiplier: float, cross_play: float, self_play: float, *, limit: float, step: float) -> float:
+    """The multiplier m_k in [0, 1] of J_XP(j, k) <= limit after new estimates of both scores.
+
+    Projected dual ascent on the excess of cross-play over the limit, as a share of self-play's excess: m_k rises by
+    `step` where cross-play is as good as self-play, and falls as far below the limit as it rises above. A member whose
+    self-play is not above the limit has no convention yet, and nothing changes.
+    """
+    if self_play <= limit:
+        return multiplier
+    excess = (cross_play - limit) / (self_play - limit)
+    return min(1.0, max(0.0, multiplier + step * excess))

@@ -15,6 +15,7 @@ from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
 from popgen.play.matches import Match
+from popgen.play.partner_constraint import PartnerConstraint
 from popgen.play.partner_strength import PartnerStrength, any_then_strongest
 from popgen.types import Kind
 
@@ -46,6 +47,8 @@ class PlayRecord:
         # All fresh episodes count, or those of one seating alone would be left of many.
         window = None if job.fresh or job.diversity is None else job.diversity.window
         self.partners = {m: PartnerStrength("max_latest", window) for m in job.learning}
+        limit, step = (None, 0.0) if job.diversity is None else (job.diversity.xp_limit, job.diversity.multiplier_step)
+        self.constraints = {m: PartnerConstraint(limit, step) for m in job.learning}
         self.own: dict[int, deque[float]] = {m: deque(maxlen=job.ppo.window) for m in job.learning}
         self.taken = dict.fromkeys(job.learning, 0)  # self-play steps
         self.rng = np.random.default_rng(job.seed)
@@ -78,14 +81,23 @@ class PlayRecord:
         return len(cross) == len(partners) and max(cross.values()) <= diversity.target_xp
 
     def plan(self, member: int, rounds: int) -> Plan:
-        """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`."""
+        """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`, times the
+        multiplier of the partner's constraint."""
         diversity, partners = self.job.diversity, self.job.partners(member)
         if diversity is None or not partners:
             return Plan()
         strength = self.partners[member].scores()
         partner = any_then_strongest(partners, strength, diversity.partner_random, self.rng)
         weight = linear(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
-        return Plan(partner, weight, diversity.lambda_mp if self.job.mixed else 0.0)
+        weight *= self._move_multipliers(member, rounds).multiplier(partner)
+        return Plan(partner, weight, diversity.lambda_mp if self.job.mixed else 0.0, diversity.xp_clip)
+
+    def _move_multipliers(self, member: int, rounds: int) -> PartnerConstraint:
+        """The constraint after the latest scores: of every iteration, or of fresh episodes where these decide."""
+        constraint, diversity = self.constraints[member], self.job.diversity
+        if diversity is not None and not (self.job.fresh and rounds % diversity.select_every):
+            constraint.add(self.partners[member].mean_scores(), self.scores(member).get("sp"))
+        return constraint
 
     def is_played(self, match: Match, plans: Mapping[int, Plan]) -> bool:
         """LIPO samples cross-play with every partner; CoMeDi with the chosen one, for both kinds."""
@@ -130,6 +142,7 @@ class PlayRecord:
         """For a checkpoint."""
         return {
             "partners": {str(m): strength.state() for m, strength in self.partners.items()},
+            "constraints": {str(m): constraint.state() for m, constraint in self.constraints.items()},
             "own": {str(m): list(scores) for m, scores in self.own.items()},
             "taken": {str(m): steps for m, steps in self.taken.items()},
             "rng": self.rng.bit_generator.state,
@@ -139,6 +152,7 @@ class PlayRecord:
         """Replace the contents with `state()` of a record of the same job."""
         for member in self.job.learning:
             self.partners[member].load_state(state["partners"][str(member)])
+            self.constraints[member].load_state(state["constraints"][str(member)])
             self.own[member].clear()
             self.own[member].extend(state["own"][str(member)])
             self.taken[member] = int(state["taken"][str(member)])

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import ViewSpec
-from popgen.losses.diversity import signed_advantage
+from popgen.losses.diversity import bound_advantage, signed_advantage
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import critic_name
 from popgen.nets.feed_forward import ValueNet, joint
@@ -36,6 +36,7 @@ class Plan:
     partner: int | None = None
     lambda_xp: float = 0.0
     lambda_mp: float = 0.0
+    xp_clip: float = 0.0
 
     def sources(self, member: int) -> list[tuple[Kind, int, float]]:
         """(kind, partner, weight), self-play first."""
@@ -210,6 +211,8 @@ def pool(
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
         counted = played.trained.any(-1)
         chosen = advantage[counted]
+        if kind is Kind.XP and own is not None:
+            chosen = bound_advantage(chosen, clip=plan.xp_clip, spread=own)
         spread = chosen.std(correction=0).clamp(min=1e-6)
         if kind is Kind.SP:
             own = spread

@@ -8,7 +8,6 @@ a mean of its own, so that its weight against lambda_XP does not depend on how m
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.losses.diversity import signed_advantage
+from popgen.losses.diversity import bound_advantage, signed_advantage
 from popgen.losses.ppo import clipped_loss
 from popgen.losses.reinforce import reinforce
 from popgen.losses.schedules import linear
@@ -83,8 +82,9 @@ def cross_play_target(
     batch: SimulatedBatch, evaluation: Evaluation, *, weight: float, spread: float, clip: float
 ) -> PolicyTarget:
     """-lambda_XP J_XP: advantages in units of self-play's `spread`, at most `clip` of them (0: without a bound)."""
-    advantage, bound = evaluation.advantage, spread * (clip or math.inf)
-    signed = signed_advantage(Kind.XP, advantage.clamp(-bound, bound), weight=weight, scale=spread)
+    advantage = evaluation.advantage
+    bounded = bound_advantage(advantage, clip=clip, spread=spread)
+    signed = signed_advantage(Kind.XP, bounded, weight=weight, scale=spread)
     seats = torch.from_numpy(batch.columns.seats)
     parts = [WeightedActions(Actions.of_seats(batch, batch.columns.cross_play, seats, signed), 1.0)]
     figures = {"advantage_xp": float(advantage.std()), "return_xp": float(evaluation.lesson.returns.mean())}
@@ -144,6 +144,7 @@ class XpmSimLearner:
         orthogonal(head, 0.01, torch.Generator().manual_seed(seed))
         self.partners = {k: frozen_actor(config, env.spec, weights) for k, weights in sorted(partners.items())}
         self.partner_scores: dict[int, float] = {}
+        self.multipliers: dict[int, float] = {}
         self.updates = self.simulated = self.trajectories = 0
         self.evaluator = MemberCritics(config, env.spec, self.partners, self.encoder, seed + 7)
         self.critics = self.evaluator.nets
@@ -185,7 +186,8 @@ class XpmSimLearner:
     def cross_play(self, batch: SimulatedBatch, partner: int, spread: float) -> PolicyTarget:
         """What the cross-play columns with `partner` teach, in units of self-play's `spread`."""
         evaluation = self.evaluator.evaluate_cross_play(batch, partner)
-        target = cross_play_target(batch, evaluation, weight=self.lambda_now(), spread=spread, clip=self.config.xp_clip)
+        weight = self.lambda_now() * self.multipliers.get(partner, 1.0)
+        target = cross_play_target(batch, evaluation, weight=weight, spread=spread, clip=self.config.xp_clip)
         return replace(target, figures=target.figures | {"partner": float(partner)})
 
     def batch_columns(self, partner: int | None) -> BatchColumns:
@@ -279,6 +281,7 @@ class XpmSimLearner:
             "simulated": self.simulated,
             "trajectories": self.trajectories,
             "partner_scores": {str(k): v for k, v in self.partner_scores.items()},
+            "multipliers": {str(k): v for k, v in self.multipliers.items()},
             "encoder": None if self.encoder is None else self.encoder.state(),
         }
 
@@ -297,3 +300,4 @@ class XpmSimLearner:
         self.updates, self.simulated = int(state["updates"]), int(state["simulated"])
         self.trajectories = int(state["trajectories"])
         self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
+        self.multipliers = {int(k): float(v) for k, v in state["multipliers"].items()}

@@ -12,6 +12,7 @@ from popgen.config.schema import (
     Fraction,
     Layers,
     NonNegative,
+    Number,
     Positive,
     Rate,
     Schema,
@@ -100,6 +101,11 @@ class XpmSimConfig(Schema):
     """Share of `updates` after which lambda_XP is 0; 1: never."""
     xp_clip: Weight = 0.0
     """Bound of cross-play advantages, in units of self-play's spread; 0: none."""
+    xp_limit: Number | None = None
+    """A score: cross-play with a partner is pressed down until it is there, by a multiplier of lambda_XP; null: always.
+    """
+    multiplier_step: Fraction = 0.5
+    """Step of that multiplier, in [0, 1], each time that real scores with the partner arrive."""
     sp_weight: Weight = 1.0
     """Weight of self-play from start states and B_SP in the objective."""
     restart_weight: Weight = 1.0

@@ -37,6 +37,7 @@ from popgen.methods.xpm_sim.round_rules import MemberProgress, round_matches, sc
 from popgen.methods.xpm_sim.workers import Learned, Workers
 from popgen.nets.weights import Weights, prefixed
 from popgen.play.episodes import Episode
+from popgen.play.partner_constraint import PartnerConstraint
 from popgen.play.partner_strength import PartnerStrength
 from popgen.types import Kind
 
@@ -58,6 +59,7 @@ class XpmSimTraining:
         self.partners: list[int] = []
         self.pairs: list[tuple[int, int]] = []
         self.progress, self.strength = MemberProgress(), PartnerStrength(self.config.partner)
+        self.constraint = PartnerConstraint(self.config.xp_limit, self.config.multiplier_step)
         self.acting: Pending[Weights] = workers.put({})
 
     def train(self) -> Loop:
@@ -77,7 +79,9 @@ class XpmSimTraining:
             now.steps += sum(one.collected.steps for one in sampled)
             yield Progress(self.member, now.steps, sampled=counted)
             self._score_episodes([episode for one in sampled for episode in one.collected.episodes])
-            ingested = self.workers.ingest([one.segments for one in sampled], self.strength.scores())
+            multipliers = {partner: self.constraint.multiplier(partner) for partner in self.partners}
+            segments = [one.segments for one in sampled]
+            ingested = self.workers.ingest(segments, self.strength.scores(), multipliers)
             learned = (learning or self.workers.learn(updates)).result()
             ingested.result()
             yield self._end_round(learned, updates)
@@ -92,12 +96,16 @@ class XpmSimTraining:
         return self.workers.play(matches, policies, self.seed * 1000 + number, horizon)
 
     def _score_episodes(self, episodes: list[Episode]) -> None:
-        """Scores of the round, and each partner's latest return in cross-play."""
+        """Scores of the round, each partner's latest return in cross-play, and what follows for its multiplier."""
         events = rewards_events(self.spec)
+        met_now = {}
         for partner in self.partners:
             met = [e for e in episodes if e.kind is Kind.XP and partner in e.members]
             self.strength.add(partner, [e.shaped if events else e.score for e in met])
+            if met:
+                met_now[partner] = sum(e.score for e in met) / len(met)
         self.progress.scores = score_round(self.progress.scores, episodes, self.partners)
+        self.constraint.add(met_now, self.progress.scores["sp"])
 
     def _end_round(self, learned: Learned, updates: int) -> Round:
         """The record of a round: what the policy that played had been trained with, and what the updates gave."""
@@ -167,6 +175,7 @@ class XpmSimTraining:
         self.partners = sorted(self.archive)
         self.pairs = seatings(first, self.partners, self.seed)
         self.progress, self.strength = MemberProgress(), PartnerStrength(self.config.partner)
+        self.constraint = PartnerConstraint(self.config.xp_limit, self.config.multiplier_step)
         self.acting = self.workers.begin_member(first, self.seed, self.archive, self.encoder)
         self.policy.load(self.acting.result())
         return (first,)
@@ -174,7 +183,8 @@ class XpmSimTraining:
     def checkpoint(self) -> State:
         """See `Training`."""
         progress, strength = asdict(self.progress), self.strength.state()
-        return {"workers": self.workers.state(), "acting": self.acting, "progress": progress, "strength": strength}
+        state = {"progress": progress, "strength": strength, "constraint": self.constraint.state()}
+        return state | {"workers": self.workers.state(), "acting": self.acting}
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """See `Training`."""
@@ -182,6 +192,7 @@ class XpmSimTraining:
         self.workers.load_state(state["workers"])
         self.progress = MemberProgress.from_state(state["progress"])
         self.strength.load_state(state["strength"])
+        self.constraint.load_state(state["constraint"])
         self.policy.load(state["acting"])  # refuses weights of other sizes
         self.acting = self.workers.put(state["acting"])
 

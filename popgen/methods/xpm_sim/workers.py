@@ -55,8 +55,11 @@ class Workers(Protocol):
         """`steps` steps from the start in every environment of the matches."""
         ...
 
-    def ingest(self, segments: list[Segments], strength: dict[int, float]) -> Pending[None]:
-        """Real episodes into the buffers B_SP and B_XP; each partner's return in real cross-play."""
+    def ingest(
+        self, segments: list[Segments], strength: dict[int, float], multipliers: dict[int, float]
+    ) -> Pending[None]:
+        """Real episodes into the buffers B_SP and B_XP; each partner's return in real cross-play, and its multiplier
+        (`popgen.play.partner_constraint`)."""
         ...
 
     def learn(self, updates: int) -> Pending[Learned]:

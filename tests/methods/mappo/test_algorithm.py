@@ -210,6 +210,20 @@ def test_training_ends_with_its_budget_or_its_targets() -> None:
     assert not ends(**(done | {"target_xp": 0.9})) and not ends(**(done | {"target": 5.1}))
 
 
+@pytest.mark.parametrize(("fresh", "weights"), [(False, [0.3, 0.2, 0.1]), (True, [0.3, 0.3, 0.2])])
+def test_a_constraint_takes_the_pressure_from_a_partner_that_is_below_its_limit(fresh: bool, weights: list) -> None:
+    """Self-play 3, cross-play 1, limit 2: a quarter of lambda_XP off with every iteration's, or choice's, scores."""
+    change = {"xp_limit": 2.0, "multiplier_step": 0.25, "lambda_xp": 0.4, "warmup": 0, "select_every": 2}
+    job = Job(ENV, PPO, CROSS.model_copy(update=change), (2,), seed=0, frozen={1: {}}, fresh=fresh)
+    played = PlayRecord(job)
+    played.own[2].append(3.0)
+    played.partners[2].add(1, [0.0], [1.0])
+    assert [played.plan(2, number).lambda_xp for number in range(3)] == pytest.approx(weights)
+    again = PlayRecord(job)
+    again.load_state(played.state())
+    assert again.constraints[2].multipliers == played.constraints[2].multipliers
+
+
 def test_a_training_leaves_nothing_in_the_users_home(solo: Mappo) -> None:
     def there() -> set[str]:
         return set(os.listdir(DEFAULT_STORAGE_PATH)) if os.path.isdir(DEFAULT_STORAGE_PATH) else set()

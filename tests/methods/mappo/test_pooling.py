@@ -112,6 +112,17 @@ def test_lower_cross_play_returns_are_preferred() -> None:
     assert cross[best] < 0 < cross[worst]
 
 
+def test_cross_play_is_bounded_by_self_plays_spread_where_told() -> None:
+    own, _ = raw(Kind.SP, 3)
+    advantage, _ = raw(Kind.XP, 1)
+    spread = float(own.std(correction=0))
+    bounded = advantage.flatten().clamp(-0.1 * spread, 0.1 * spread)
+    expected = -0.5 * (bounded - bounded.mean()) / spread  # its own spread is smaller now
+    assert bounded.abs().max() < advantage.abs().max()
+    pooled = batch(Plan(1, lambda_xp=0.5, xp_clip=0.1))
+    torch.testing.assert_close(pooled.advantage[pooled.cross], expected)
+
+
 def test_only_the_members_own_seats_are_trained() -> None:
     pooled = batch(Plan(1, lambda_xp=0.5))
     rollouts = kinds()

@@ -41,9 +41,9 @@ class Answers:
         episodes = [Episode(m.kind, m.members, 3.0 if m.kind is Kind.SP else 1.0, 0.5) for m in matches]
         return [Sampled(Collected("s", counts, episodes), {Kind.SP: HANDLE, Kind.XP: HANDLE})]
 
-    def ingest(self, segments: Any, strength: dict[int, float]) -> Any:
+    def ingest(self, segments: Any, strength: dict[int, float], multipliers: dict[int, float]) -> Any:
         assert all(part is HANDLE for by_kind in segments for part in by_kind.values())
-        self.asked.append(("ingest", strength))
+        self.asked.append(("ingest", strength, multipliers))
         return Ready(None)
 
     def learn(self, updates: int) -> Any:
@@ -60,9 +60,9 @@ class Answers:
         return Ready(None)
 
 
-def trained(schedule: str) -> tuple[list[Any], list[Any]]:
+def trained(schedule: str, *further: str) -> tuple[list[Any], list[Any]]:
     """Records of member 2, five updates of which two are in a round; what was asked for."""
-    changes = ["xpm_sim.updates=5", "xpm_sim.updates_per_round=2", f"run.schedule={schedule}"]
+    changes = ["xpm_sim.updates=5", "xpm_sim.updates_per_round=2", f"run.schedule={schedule}", *further]
     config = RunConfig.parse(compose(["method=xpm_sim", "scale=smoke", "seed=3", *changes]))
     spec = make_env(config.env.name, 1, **config.env.params).spec
     workers: Any = Answers(make_actor(config.xpm_sim, spec).weights())
@@ -98,4 +98,11 @@ def test_updates_overlap_with_episodes_where_told(schedule: str, order: list[str
     _, asked = trained(schedule)
     assert [name for name, *_ in asked] == ["begin", *order]
     assert [count for name, count, *_ in asked if name == "learn"] == [2, 2, 1]
-    assert [strength for name, strength, *_ in asked if name == "ingest"] == [{1: 0.5}] * 3  # shaped, not the score
+    told = [told for name, *told in asked if name == "ingest"]
+    assert told == [[{1: 0.5}, {1: 1.0}]] * 3  # the shaped return, not the score; no constraint
+
+
+def test_the_multiplier_of_a_partner_follows_its_score() -> None:
+    """Self-play 3, cross-play 1: with a limit of 2 each round takes a whole step's share of -1 off."""
+    _, asked = trained("sync", "xpm_sim.xp_limit=2.0", "xpm_sim.multiplier_step=0.25")
+    assert [multipliers for name, *_, multipliers in asked if name == "ingest"] == [{1: 0.75}, {1: 0.5}, {1: 0.25}]
