@@ -28,7 +28,7 @@ class AgentActor:
 
     def _fresh_learner(self, member: int, seed: int) -> AgentLearner:
         config, device = self.config, device_of(self.config.cluster.agent_gpus)
-        return AgentLearner(config.agent, config.world_model, self.spec, member, seed, device)
+        return AgentLearner(config.agent, config.world_model, self.spec, member, seed, device, config.discovery)
 
     def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
         """A fresh actor and critics beside frozen predecessors (acting weights by member)."""
@@ -47,11 +47,15 @@ class AgentActor:
         self.learner.set_model(model)
         self.learner.set_starts(task.starts.result(), task.new_share)
         self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
+        rates: dict[str, float] = {}
+        if task.tally is not None:
+            recent = None if task.recent is None else task.recent.result()
+            rates = self.learner.compare_with_real_play(task.tally, recent)
         totals: dict[str, list[float]] = defaultdict(list)
         for _ in range(task.updates):
             for name, value in self.learner.update().items():
                 totals[name].append(value)
-        means = {name: float(np.mean(values)) for name, values in totals.items()}
+        means = {name: float(np.mean(values)) for name, values in totals.items()} | rates
         means["seconds"] = time.perf_counter() - began
         means["cpu_seconds"] = time.process_time() - began_cpu
         means["update_ms"] = 1000.0 * means["seconds"] / task.updates

@@ -7,16 +7,22 @@ from typing import Any
 from popgen.actors.actor_setup import build_env
 from popgen.config.sections import EnvConfig
 from popgen.methods.training import Pending
+from popgen.methods.xpm_wm.play_tally import Tally, TallyKeeper
 from popgen.methods.xpm_wm.replay import Replay, Windows
 from popgen.methods.xpm_wm.window_requests import Request, draw
 from popgen.types import Segment
 
 
 class ReplayActor:
-    """Takes segments once each and serves encoded windows."""
+    """Takes segments once each, serves encoded windows, and tells what it has taken in.
 
-    def __init__(self, env: EnvConfig, capacity: int, seed: int) -> None:
+    Args:
+        counted: view whose players' own states are counted; "" for none.
+    """
+
+    def __init__(self, env: EnvConfig, capacity: int, seed: int, counted: str = "") -> None:
         self.replay = Replay(build_env(env, 1), capacity, seed)
+        self.keeper = TallyKeeper(self.replay.env, counted)
         self.seen: set[tuple[str, int]] = set()
         self.turn = 0
 
@@ -27,6 +33,7 @@ class ReplayActor:
             if key not in self.seen:
                 self.seen.add(key)
                 self.replay.add(segment, owner)
+                self.keeper.add(segment, owner)
         return self.replay.size
 
     def draw(self, requests: tuple[Request, ...], length: int, view: str, repeats: int) -> list[list[Windows | None]]:
@@ -37,9 +44,14 @@ class ReplayActor:
             self.turn += 1
         return drawn
 
+    def tally(self, owner: int) -> Tally:
+        """Of all segments so far, with `owner` as the present member."""
+        return self.keeper.tally(owner)
+
     def state(self) -> dict[str, Any]:
         """Contents, counters and generator."""
-        return {"replay": self.replay.state(), "seen": sorted([list(key) for key in self.seen]), "turn": self.turn}
+        seen = sorted([list(key) for key in self.seen])
+        return {"replay": self.replay.state(), "seen": seen, "turn": self.turn, "tally": self.keeper.state()}
 
     def marks(self) -> dict[str, Any]:
         """What `state` holds beside the contents: small enough for every iteration."""
@@ -56,3 +68,4 @@ class ReplayActor:
         self.replay.load_state(contents["replay"])
         self.seen = {(str(name), int(number)) for name, number in contents["seen"]}
         self.turn = int(contents["turn"])
+        self.keeper.load_state(contents["tally"])

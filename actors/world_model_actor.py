@@ -14,13 +14,14 @@ from popgen.methods.training import Pending
 from popgen.methods.transport import Transport, Worker
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
-from popgen.methods.xpm_wm.replay import Windows
+from popgen.methods.xpm_wm.replay import Query, Windows
 from popgen.methods.xpm_wm.start_states import OLD, Starts
-from popgen.methods.xpm_wm.window_requests import join
+from popgen.methods.xpm_wm.window_requests import Request, join
 from popgen.methods.xpm_wm.windows import Draws, model_batch, start_batch
-from popgen.methods.xpm_wm.workers import ModelUpdate
+from popgen.methods.xpm_wm.workers import ModelTask, ModelUpdate
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
 from popgen.nets.weights import Weights, under, weights_of
+from popgen.types import Kind
 
 CHUNK = 25
 """Updates whose batches are drawn in one call."""
@@ -61,11 +62,11 @@ class WorldModelActor:
         sp, xp = (one.result() for one in pending)
         return [a + b for a, b in zip(sp, xp, strict=True)]
 
-    def train(self, updates: int, starts_per_update: int, chosen: bool = True) -> ModelUpdate:
-        """`updates` gradient steps; weights, start states from the training windows (with those that were chosen for
-        an event or without) and mean metrics. Weights and states stay in the store."""
+    def train(self, task: ModelTask) -> ModelUpdate:
+        """Gradient steps; weights, start states from the training windows and mean metrics. Weights and states stay in
+        the store."""
         began, began_cpu = time.perf_counter(), time.process_time()
-        config, learner = self.config.world_model, self.learner
+        config, learner, updates = self.config.world_model, self.learner, task.updates
         totals: dict[str, list[float]] = defaultdict(list)
         starts: list[Starts] = []
         for first in range(0, updates, CHUNK):
@@ -80,14 +81,29 @@ class WorldModelActor:
                 metrics, seen = learner.update(windows)
                 for name, value in metrics.items():
                     totals[name].append(value)
-                if starts_per_update:
-                    starts.append(learner.starts(seen, windows, starts_per_update, pool=OLD, chosen=chosen))
+                if count := task.starts_per_update:
+                    starts.append(learner.starts(seen, windows, count, pool=OLD, chosen=task.chosen, rare=task.rare))
+        recent = self._recent_starts(task.recent_rows)
         means = {name: float(np.mean(values)) for name, values in totals.items()}
         means["seconds"] = time.perf_counter() - began
         means["cpu_seconds"] = time.process_time() - began_cpu
         means["update_ms"] = 1000.0 * means["seconds"] / max(1, updates)
         stored = self.transport.put(Starts.concat(starts)) if starts else None
-        return ModelUpdate(self.weights(), stored, means)
+        return ModelUpdate(self.weights(), stored, means, recent)
+
+    def _recent_starts(self, rows: int) -> Pending[Starts] | None:
+        """Start states of the last so many rows of this member's self-play, none of them chosen; None where there are
+        none."""
+        if not rows:
+            return None
+        length, count = self.config.world_model.length, self.config.discovery.trust_starts
+        per_window = max(1, length // 2)
+        query = Query(owner=self.member, kind=Kind.SP, last=rows)
+        part = self._draw_windows(Draws(sp=(Request(query, -(-count // per_window)),)), length, 1)[0][0]
+        if part is None:
+            return None
+        seen = self.learner.posteriors(part)
+        return self.transport.put(self.learner.starts(seen, part, count, pool=OLD, skip=length - per_window))
 
     def cache_starts(self) -> Starts:
         """A later member's start states, seen through the present world model."""

@@ -15,8 +15,9 @@ from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled
 from popgen.methods.transport import Place, Transport, Worker
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
+from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.start_states import Starts
-from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelUpdate
+from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match
 from popgen.types import Kind
@@ -49,8 +50,9 @@ class XpmWmWorkers:
         cluster, seed, start = config.cluster, config.run.seed * 1000, transport.start
         self.pool = start_samplers(config, attempt, transport)
         place, capacity = Place(cluster.replay_cpus), config.replay.capacity
+        counted = config.world_model.view if config.discovery.count_bonus else ""
         self.replays: dict[str, Worker[ReplayActor]] = {
-            name: start(ReplayActor, place, config.env, capacity, seed + number)
+            name: start(ReplayActor, place, config.env, capacity, seed + number, counted)
             for name, number in zip(BUFFERS, (11, 12), strict=True)
         }
         self.model: Worker[WorldModelActor] = start(
@@ -114,9 +116,13 @@ class XpmWmWorkers:
 
     # ---- learning --------------------------------------------------------------------------------------------------
 
-    def update_world_model(self, updates: int, starts_per_update: int, chosen: bool = True) -> Pending[ModelUpdate]:
+    def update_world_model(self, task: ModelTask) -> Pending[ModelUpdate]:
         """The world-model learner's."""
-        return self.model.ask(WorldModelActor.train, updates, starts_per_update, chosen)
+        return self.model.ask(WorldModelActor.train, task)
+
+    def tally(self, member: int) -> Pending[Tally]:
+        """B_SP's."""
+        return self.replays["replay_sp"].ask(ReplayActor.tally, member)
 
     def cache_starts(self) -> Pending[Starts]:
         """The world-model learner's."""

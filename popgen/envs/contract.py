@@ -23,6 +23,8 @@ class ViewSpec:
         maxima: for a view of channels (last dimension) that are counts of different size, the largest value of each;
             those of maximum 1 hold 0 and 1 only. None where `scale` serves all.
         swap: for a flat view, index array with obs_of_player_1 == obs_of_player_0[swap]; else None.
+        own: for a flat view, the entries that describe the looking player alone, in parts (where it stands, where it
+            looks, what it holds); else empty.
     """
 
     shape: tuple[int, ...]
@@ -31,6 +33,7 @@ class ViewSpec:
     scale: float = 1.0
     swap: tuple[int, ...] | None = None
     maxima: tuple[float, ...] | None = None
+    own: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,9 @@ class Kitchen:
 
 def make_spec(kitchen: Kitchen) -> EnvSpec:
     """The record that the rest of popgen works with."""
-    features = ViewSpec((len(kitchen.tables.feature_names),), "uint8", True, 1.0, _swap_players(kitchen.tables))
+    tables = kitchen.tables
+    shape, swap, own = (len(tables.feature_names),), _swap_players(tables), _list_own_parts(tables)
+    features = ViewSpec(shape, "uint8", True, 1.0, swap, own=own)
     return EnvSpec(
         name=f"overcooked/{kitchen.layout.name}",
         horizon=kitchen.horizon,
@@ -95,15 +97,21 @@ def _make_lossless_view(kitchen: Kitchen) -> ViewSpec:
     return ViewSpec(shape, "uint8", False, float(maxima.max()), maxima=tuple(maxima.tolist()))
 
 
+def _list_own_parts(tables: Tables) -> tuple[tuple[int, ...], ...]:
+    """Of the player who looks: its cell, its orientation and what it holds. The other's follow each."""
+    parts, start = [], 0
+    for size in (int(tables.meta[k.M_FLOOR]), 4, int(tables.meta[k.M_ITEM])):
+        parts.append(tuple(range(start, start + size)))
+        start += 2 * size
+    return tuple(parts)
+
+
 def _swap_players(tables: Tables) -> tuple[int, ...]:
     """Index array that turns one player's features into the other's."""
-    meta = tables.meta
     order: list[int] = []
-    start = 0
-    for size in (int(meta[k.M_FLOOR]), 4, int(meta[k.M_ITEM])):
-        order += [*range(start + size, start + 2 * size), *range(start, start + size)]
-        start += 2 * size
-    return (*order, *range(start, len(tables.feature_names)))
+    for part in _list_own_parts(tables):
+        order += [entry + len(part) for entry in part] + list(part)
+    return (*order, *range(len(order), len(tables.feature_names)))
 
 
 def _digest_rules(kitchen: Kitchen) -> str:

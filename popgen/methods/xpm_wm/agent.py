@@ -8,6 +8,7 @@ By REINFORCE, as in the paper, or by PPO's clipped surrogate in several passes o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,17 +16,18 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec
-from popgen.losses.schedules import geometric, linear
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent_networks import SELF, AgentNetworks
+from popgen.methods.xpm_wm.agent_schedules import cross_play_weight, entropy_scale
 from popgen.methods.xpm_wm.agent_targets import (
     PolicyTarget,
     cross_play_target,
     sample_losses,
     self_play_target,
 )
-from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
-from popgen.methods.xpm_wm.imagination import Imagined, imagine
+from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig, WorldModelConfig
+from popgen.methods.xpm_wm.discovery import Discovery
+from popgen.methods.xpm_wm.imagination import Imagined, JointActor, expected_pay, imagine
 from popgen.methods.xpm_wm.imagined_play import (
     ImaginedPlay,
     cross_play_seats,
@@ -33,9 +35,9 @@ from popgen.methods.xpm_wm.imagined_play import (
     joint_actor,
     start_latents,
 )
-from popgen.methods.xpm_wm.latents import Latent
+from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.policy_samples import Samples
-from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.start_states import NEW_SP, Starts
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
 from popgen.play.partner_strength import any_or_strongest
@@ -66,6 +68,7 @@ class AgentLearner:
         member: int,
         seed: int,
         device: str | torch.device = "cpu",
+        discovery: DiscoveryConfig | None = None,
     ) -> None:
         self.config, self.model_config, self.spec, self.member = config, model_config, spec, member
         self.device = torch.device(device)
@@ -73,6 +76,7 @@ class AgentLearner:
         self.generator = torch.Generator(self.device).manual_seed(seed + 1)
         self.rng = np.random.default_rng(seed + 2)
         self.model = WorldModel(model_config, spec).to(self.device, self.dtype).eval().requires_grad_(False)
+        self.discovery = Discovery(discovery or DiscoveryConfig(), spec, model_config.view, self.device)
         self.partners: dict[int, Actor] = {}
         self.starts: Starts | None = None
         self.new_share = 0.0
@@ -80,7 +84,7 @@ class AgentLearner:
         self.imagined_scores: dict[int, float] = {}
         self.plays = False
         self.networks = self._fresh_networks(seed)
-        self.updates = self.playing = 0
+        self.updates = self.playing = self.finding = 0
 
     def _fresh_networks(self, seed: int) -> AgentNetworks:
         actions = self.spec.num_actions
@@ -99,7 +103,7 @@ class AgentLearner:
     def restart(self, seed: int) -> None:
         """Fresh actor, critics and return scale: the world model stays."""
         self.networks = self._fresh_networks(seed)
-        self.updates = self.playing = 0
+        self.updates = self.playing = self.finding = 0
 
     def add_partner(self, member: int, actor_weights: w.Weights) -> None:
         """A frozen predecessor, with a critic of its own; it acts on the current world model's latents."""
@@ -142,33 +146,19 @@ class AgentLearner:
         self.networks.update_copies()
         self.updates += 1
         self.playing += self.plays
+        self.finding += self.discovery.found()
         return figures
 
     def _cast_automatically(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16)
 
     def lambda_now(self) -> float:
-        """lambda_XP of this update: rising from `lambda_start`, if that is less, to `lambda_xp` over
-        `lambda_ramp` updates.
-
-        Cross-play pressure must be there from the first update, or the member settles on its predecessor's
-        convention; at full strength from the start it keeps self-play from starting at all.
-        """
-        config = self.config
-        start = min(config.lambda_start, config.lambda_xp)
-        return linear(start, config.lambda_xp, self.updates, config.lambda_ramp)
+        """lambda_XP of this update."""
+        return cross_play_weight(self.config, self.updates)
 
     def entropy_now(self) -> float:
-        """Entropy scale of this update: `entropy` until self-play has started, then falling to `entropy_end` within
-        `entropy_ramp` updates, by the same factor in each.
-
-        In units of the returns' range, which grows tenfold once dishes are delivered, advantages shrink: a scale that
-        lets self-play start would then win over them, and the policy would get more random the better it plays.
-        """
-        config = self.config
-        if not config.entropy_ramp or not self.playing:
-            return config.entropy
-        return geometric(config.entropy, min(config.entropy_end, config.entropy), self.playing, config.entropy_ramp)
+        """Entropy scale of this update."""
+        return entropy_scale(self.config, self.discovery.config, self.finding, self.playing)
 
     def imagine_play(self, partner: int | None) -> ImaginedPlay:
         """A batch of imagined self-play and, with a partner, of cross-play."""
@@ -179,19 +169,49 @@ class AgentLearner:
         seats = cross_play_seats(config.starts_xp if partner is not None else 0, self.device)
         other = self.partners[partner] if partner is not None and len(seats) else None
         act = joint_actor(self.networks.rollout_actor, other, config.starts_sp, seats, self.generator)
-        imagined = imagine(self.model, act, self.start_states(rows), config.horizon, self.generator)
-        return ImaginedPlay(imagined, seats)
+        return ImaginedPlay(self._imagine(act, rows), seats)
 
-    def start_states(self, rows: np.ndarray) -> Latent:
-        """Stored states as the world model's."""
+    def _imagine(self, act: JointActor, rows: np.ndarray) -> Imagined:
         assert self.starts is not None
-        return start_latents(self.starts, rows, self.model_config.classes, self.device, self.dtype)
+        start = start_latents(self.starts, rows, self.model_config.classes, self.device, self.dtype)
+        pay = self.discovery.pay if self.discovery.changes_pay else expected_pay
+        return imagine(self.model, act, start, self.config.horizon, self.generator, pay)
+
+    def compare_with_real_play(self, tally: Tally, recent: Starts | None) -> dict[str, float]:
+        """Take in what real play has shown; how often each event happens in it and in imagination from `recent`
+        states of it, or from this member's self-play among the states to start from; figures of both."""
+        discovery = self.discovery
+        discovery.tally = tally
+        if not discovery.config.trust or (events := self._imagined_rates(recent)) is None:
+            return {}
+        return discovery.compare(events, tally)
+
+    def _imagined_rates(self, recent: Starts | None) -> np.ndarray | None:
+        """(E,) events a step that the present policy imagines; None without states to start from."""
+        starts = recent if recent is not None else self.starts
+        rows = np.arange(len(starts)) if recent is not None else np.flatnonzero(starts.pool == NEW_SP)
+        if not len(rows):
+            return None
+        rows = self.rng.choice(rows, self.discovery.config.trust_starts)
+        start = start_latents(starts, rows, self.model_config.classes, self.device, self.dtype)
+        none = cross_play_seats(0, self.device)
+        act = joint_actor(self.networks.rollout_actor, None, len(rows), none, self.generator)
+        imagined = imagine(self.model, act, start, self.config.horizon, self.generator)
+        happened = self.model.event_probs(imagined.latent[1:]).unflatten(-1, (self.spec.num_players, -1)) > 0.5
+        return happened.sum(2).float().mean((0, 1)).cpu().numpy().astype(np.float64)
 
     # ---- what a batch teaches ------------------------------------------------------------------------------------
 
     def self_play(self, imagined: Imagined) -> PolicyTarget:
-        """+J_SP, which sets the unit of all advantages."""
-        return self_play_target(self.networks, imagined, self.entropy_now())
+        """+J_SP, which sets the unit of all advantages; with the count bonus, where there is one."""
+        scale = self.discovery.bonus_scale(self.plays)
+        if not scale:
+            return self_play_target(self.networks, imagined, self.entropy_now())
+        bonus = self.discovery.bonus(self.model, imagined.latent[1:], scale)
+        paid = replace(imagined, reward=imagined.reward + bonus)
+        target = self_play_target(self.networks, paid, self.entropy_now())
+        figures = {"imagined_shaped_sp": float(imagined.reward.mean()), "count_bonus": float(bonus.mean())}
+        return replace(target, figures=target.figures | figures)
 
     def cross_play(self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor) -> PolicyTarget:
         """-lambda_XP J_XP, in self-play's unit; what is earned with the partner is remembered."""
@@ -238,6 +258,8 @@ class AgentLearner:
             "rng": self.rng.bit_generator.state,
             "updates": self.updates,
             "playing": self.playing,
+            "finding": self.finding,
+            "discovery": self.discovery.state(),
             "partner_scores": {str(k): v for k, v in self.partner_scores.items()},
             "imagined_scores": {str(k): v for k, v in self.imagined_scores.items()},
         }
@@ -247,6 +269,7 @@ class AgentLearner:
         self.networks.load_state(state)
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
         self.rng.bit_generator.state = state["rng"]
-        self.updates, self.playing = int(state["updates"]), int(state["playing"])
+        self.updates, self.playing, self.finding = (int(state[name]) for name in ("updates", "playing", "finding"))
+        self.discovery.load_state(state["discovery"])
         self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
         self.imagined_scores = {int(k): float(v) for k, v in state["imagined_scores"].items()}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from popgen.losses.diversity import signed_advantage
@@ -63,6 +63,8 @@ def self_play_target(networks: AgentNetworks, imagined: Imagined, entropy_scale:
     if networks.config.advantage_unit == "spread":  # centred as usual: a shift of all advantages only adds noise
         running = advantage[imagined.running > 0.5]
         advantage, unit = advantage - running.mean(), running.std().clamp(min=LEAST_SPREAD)
+        if networks.config.advantage_clip:
+            advantage, unit = clip_advantages(advantage, imagined.running > 0.5, networks.config.advantage_clip)
     signed = signed_advantage(Kind.SP, advantage, weight=1.0, scale=unit)
     figures = {
         "entropy_scale": entropy_scale,
@@ -74,6 +76,15 @@ def self_play_target(networks: AgentNetworks, imagined: Imagined, entropy_scale:
     }
     samples = Samples.from_imagined(imagined, SELF, players, returns, signed, entropy_scale)
     return PolicyTarget(add_log_probs(networks, samples), unit, figures)
+
+
+def clip_advantages(
+    advantage: Float[Tensor, "H B"], running: Bool[Tensor, "H B"], times: float
+) -> tuple[Float[Tensor, "H B"], Float[Tensor, ""]]:
+    """Centred advantages cut at so many `times` their mean magnitude in running states, and their spread then."""
+    bound = times * advantage[running].abs().mean()
+    cut = advantage.clamp(-bound, bound)
+    return cut, cut[running].std().clamp(min=LEAST_SPREAD)
 
 
 def cross_play_target(

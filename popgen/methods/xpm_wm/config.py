@@ -143,6 +143,9 @@ class AgentConfig(Schema):
     """Largest change of the probability ratio that the surrogate rewards (PPO's epsilon)."""
     advantage_unit: Literal["spread", "returns"] = "spread"
     """Unit of all advantages: their spread in self-play, or the range of self-play's returns."""
+    advantage_clip: Weight = 0.0
+    """Self-play's advantages are cut at so many times their mean magnitude before their spread is taken, so that a few
+    rare rewards do not set the unit of all others; 0: not cut."""
     actor_lr: Rate = 1e-3
     """Adam's step size of the actor."""
     critic_lr: Rate = 1e-3
@@ -309,6 +312,33 @@ class Phase2Config(Schema):
         return self
 
 
+class DiscoveryConfig(Schema):
+    """What finds rewards that chance hardly ever meets, and keeps the actor from those that the model makes up.
+
+    All of it is off where the numbers are 0.
+    """
+
+    count_bonus: Weight = 0.0
+    """In imagined self-play each player also earns this / sqrt(1 + n), n the real steps in which a player's own state
+    (a view's `own` entries) was the same. Half of it once the dearest event is found, none once self-play has begun."""
+    found_events: NonNegative = 0
+    """So often must the dearest event have been seen in real play to count as found; 0: it never does."""
+    found_entropy: Weight = 0.03
+    """Scale to which the entropy bonus falls, within `agent.entropy_ramp` updates, once the dearest event is found; it
+    falls further, to `agent.entropy_end`, once self-play has begun."""
+    rare_events: NonNegative = 0
+    """An imagined event that real play has shown fewer times is paid and ends its trajectory, and imagination does not
+    start from what follows it in a window: the model knows too little of that."""
+    trust: Weight = 0.0
+    """An imagined event counts for this times its real rate over its imagined one, at most in full; 0: in full.
+    Imagined rates are taken with the present policy from unchosen states of the member's own latest play."""
+    trust_starts: Batch = 512
+    """Imagined trajectories behind a comparison of the rates."""
+    event_factors: dict[str, Weight] = {}
+    """By name, what the weights of events are multiplied with in imagination: pick-ups that pay as much as the steps
+    which they are for are made for their own sake."""
+
+
 class XpmWmRun(RunConfig):
     """A run of XPM-WM."""
 
@@ -324,6 +354,7 @@ class XpmWmRun(RunConfig):
     """Member 1, together with the world model."""
     phase2: Phase2Config = Phase2Config()
     """Later members, mostly in imagination."""
+    discovery: DiscoveryConfig = DiscoveryConfig()
 
     @model_validator(mode="after")
     def _check_windows(self) -> XpmWmRun:

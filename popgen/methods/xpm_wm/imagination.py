@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -45,9 +46,29 @@ class Imagined:
         )
 
 
+class Paid(NamedTuple):
+    """What arriving in states (H, B) earned, and the probability that the episode goes on from them."""
+
+    reward: Tensor
+    keep: Tensor
+
+
+Pay = Callable[[WorldModel, Latent], Paid]
+
+
+def expected_pay(model: WorldModel, arrived: Latent) -> Paid:
+    """As the world model predicts it."""
+    return Paid(model.reward(arrived).float(), model.continuation(arrived).float())
+
+
 @torch.no_grad()
 def imagine(
-    model: WorldModel, act: JointActor, start: Latent, horizon: int, generator: torch.Generator | None = None
+    model: WorldModel,
+    act: JointActor,
+    start: Latent,
+    horizon: int,
+    generator: torch.Generator | None = None,
+    pay: Pay = expected_pay,
 ) -> Imagined:
     """Roll the prior forward for `horizon` steps from start (B, .) with the joint policy `act`."""
     states, actions = [start], []
@@ -56,7 +77,6 @@ def imagine(
         actions.append(joint)
         states.append(model.step(states[-1], joint, generator))
     latent = Latent(torch.stack([s.h for s in states]), torch.stack([s.z for s in states]))
-    arrived = latent[1:]
-    keep = model.continuation(arrived).float()
+    reward, keep = pay(model, latent[1:])
     running = torch.cat([torch.ones_like(keep[:1]), keep[:-1]]).cumprod(0)
-    return Imagined(latent, torch.stack(actions), model.reward(arrived).float(), keep, running)
+    return Imagined(latent, torch.stack(actions), reward, keep, running)

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from popgen.methods.training import Pending, State
-from popgen.methods.xpm_wm.config import Phase1Config, Phase2Config
+from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
+from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.start_states import Starts
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
@@ -87,7 +88,7 @@ class FirstMemberProgress:
         figures: the last value of every figure.
         best: the policy of the best window.
         published, played: the weights learned last, and those that play.
-        model, starts: of the world model's last update.
+        model, starts, recent_starts: of the world model's last update.
     """
 
     window: int
@@ -106,6 +107,7 @@ class FirstMemberProgress:
     played: MemberWeights | None = None
     model: Pending[Weights] | None = None
     starts: Pending[Starts] | None = None
+    recent_starts: Pending[Starts] | None = None
 
     @property
     def latest(self) -> MemberWeights:
@@ -143,6 +145,7 @@ class FirstMemberProgress:
             "published": self.latest.to_state(),
             "model": self.model,
             "starts": self.starts,
+            "recent_starts": self.recent_starts,
         }
 
     @staticmethod
@@ -161,6 +164,7 @@ class FirstMemberProgress:
             published=MemberWeights.from_state(state["published"], put),
             model=put(state["model"]),
             starts=put(Starts(**state["starts"])),
+            recent_starts=None if state["recent_starts"] is None else put(Starts(**state["recent_starts"])),
         )
         progress.add_scores(map(float, state["recent"]), map(float, state["shaped"]))
         return progress
@@ -207,6 +211,19 @@ class LaterMemberProgress:
         strength.load_state(state["strength"])
         best = Candidate.from_state(state["best"], put)
         return LaterMemberProgress(strength, steps, int(state["rounds"]), bool(state["plays"]), best)
+
+
+# ---- what real play has shown ----------------------------------------------------------------------------------------
+
+
+def goes_by_tally(config: DiscoveryConfig) -> bool:
+    """Whether anything depends on what real play has shown."""
+    return bool(config.count_bonus or config.found_events or config.rare_events or config.trust)
+
+
+def rare_events(tally: Tally | None, config: DiscoveryConfig) -> tuple[int, ...]:
+    """Events that real play has shown too seldom to imagine what follows them."""
+    return () if tally is None else tuple(np.flatnonzero(tally.events < config.rare_events).tolist())
 
 
 # ---- rules of phase 1 ------------------------------------------------------------------------------------------------

@@ -62,6 +62,7 @@ def check_run(config: XpmWmRun, spec: EnvSpec) -> None:
         problem = f"{config.method} needs an environment with weighted events, {spec.name} has none"
         raise UserError("env.name", problem, "choose another environment")
     _check_lengths(config, spec)
+    _check_discovery(config, spec)
 
 
 def _check_view(config: XpmWmRun, spec: EnvSpec) -> None:
@@ -81,3 +82,14 @@ def _check_lengths(config: XpmWmRun, spec: EnvSpec) -> None:
     if config.replay.capacity < added:
         problem = f"cannot hold the {added:,} steps that phase2 adds at once"
         raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
+
+
+def _check_discovery(config: XpmWmRun, spec: EnvSpec) -> None:
+    view = spec.views[config.world_model.view]
+    if config.discovery.count_bonus and not (view.own and view.binary):
+        problem = f"view {config.world_model.view!r} of {spec.name} does not tell a player's own state apart"
+        raise UserError("discovery.count_bonus", problem, "set it to 0 or choose another view")
+    for name in config.discovery.event_factors:
+        if name not in spec.event_names:
+            problem = f"{spec.name} has no event {name!r}"
+            raise UserError("discovery.event_factors", problem, f"choose among {', '.join(spec.event_names)}")

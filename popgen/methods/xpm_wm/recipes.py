@@ -5,6 +5,7 @@ from __future__ import annotations
 from popgen.methods.recipe import Recipe, because, ours
 
 _CHANCE = "chance alone must find the first soup (docs/notes/learning.md, Forced coordination)"
+_FALSE_DELIVERIES = "imagined deliveries must not outnumber real ones (docs/notes/learning.md, The counter circuit)"
 _NEVER = "never reached: the table's steps are what is run"
 
 LAPTOP = Recipe(
@@ -28,6 +29,28 @@ LAPTOP = Recipe(
         "overcooked/forced_coordination": {
             "agent.entropy": because(0.04, _CHANCE),
             "phase1.model_updates": because(40, "the model learns more from the few soups that there are"),
+        },
+        "overcooked/counter_circuit_o_1order": {
+            "world_model.batch": because(32, "more and smaller updates know the kitchen sooner"),
+            "agent.discount": because(0.97, "with 0.99 values at the end of imagination run away"),
+            "agent.advantage_clip": because(5.0, "the first deliveries would inflate the unit of all advantages"),
+            "agent.entropy": because(0.08, "at less, roles settle before soups are carried to the counter"),
+            "agent.entropy_end": 0.02,
+            "replay.event_fraction": because(0.25, "few windows repeated often are believed"),
+            "phase1.pretrain_updates": 3000,
+            "phase1.steps_per_iteration": 200,
+            "phase1.model_updates": because(120, _FALSE_DELIVERIES),
+            "phase1.agent_updates": 7,
+            "phase1.event_starts": "always",
+            "phase1.max_steps": 3_200_000,
+            "discovery.count_bonus": because(1.0, "carries soups across the border between the players' roles"),
+            "discovery.trust": because(2.0, _FALSE_DELIVERIES),
+            "discovery.rare_events": 300,
+            "discovery.found_events": because(500, "some hundred deliveries, from which the model learns the rest"),
+            "discovery.found_entropy": 0.03,
+            "discovery.event_factors": because(
+                {"takes_ingredient": 0.2, "takes_dish": 0.2}, "counters are near: pick-ups alone would be farmed"
+            ),
         },
     },
 )

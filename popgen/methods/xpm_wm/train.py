@@ -15,7 +15,16 @@ from popgen.methods.xpm_wm import real_matches as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.overlap import Overlap
-from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, ModelUpdate, Setup, named_figures
+from popgen.methods.xpm_wm.play_tally import Tally
+from popgen.methods.xpm_wm.workers import (
+    AgentTask,
+    AgentUpdate,
+    ModelReports,
+    ModelTask,
+    ModelUpdate,
+    Setup,
+    named_figures,
+)
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER
 
@@ -114,13 +123,21 @@ class FirstMember:
     def update_world_model(self, updates: int) -> Pending[ModelUpdate]:
         """Lines 6 and 7. Imagination starts from chosen windows only once self-play has begun: before, the model does
         not know what follows a rare event, and nothing corrects it."""
-        chosen = self.progress.plays or self.phase.event_starts == "always"
-        return self.work.update_world_model(updates, self.config.agent.starts_sp, chosen)
+        progress, discovery = self.progress, self.config.discovery
+        chosen = progress.plays or self.phase.event_starts == "always"
+        rare = rules.rare_events(self.tally(), discovery)
+        recent = self.phase.envs * self.phase.steps_per_iteration if discovery.trust else 0
+        return self.work.update_world_model(ModelTask(updates, self.config.agent.starts_sp, chosen, rare, recent))
+
+    def tally(self) -> Tally | None:
+        """What real play has shown so far, where anything goes by it."""
+        return self.work.tally(FIRST).result() if rules.goes_by_tally(self.config.discovery) else None
 
     def update_agent(self) -> Pending[AgentUpdate]:
         """Lines 8 and 12 to 15, without partners."""
-        task = AgentTask(self.phase.agent_updates, *self.progress.imagination, 0.0, {}, self.progress.plays)
-        return self.work.update_agent(task)
+        progress = self.progress
+        task = AgentTask(self.phase.agent_updates, *progress.imagination, 0.0, {}, progress.plays)
+        return self.work.update_agent(replace(task, tally=self.tally(), recent=progress.recent_starts))
 
     def take_in(self, kind: str, result: Result, sampled: list[Sampled]) -> tuple[float, float]:
         """Seconds and processor seconds that a finished task took; what it gave is the newest now."""
@@ -131,6 +148,7 @@ class FirstMember:
             return 0.0, result.collected.cpu_seconds
         if isinstance(result, ModelUpdate):
             progress.model, progress.starts = result.weights, result.starts
+            progress.recent_starts = result.recent
         else:
             progress.published = result.weights
         progress.figures |= named_figures(kind, result.metrics)
@@ -200,7 +218,7 @@ class LaterMember:
         yield Phase(f"member {self.member}: imagined self-play and cross-play", total)
         while rules.plays_on(progress, phase, self.most_rounds):  # 4
             if progress.rounds:
-                update = self.work.update_world_model(phase.model_updates, 0).result()  # 5-7
+                update = self.work.update_world_model(ModelTask(phase.model_updates)).result()  # 5-7
                 yield Progress(self.member, progress.steps, named_figures("model", update.metrics))
             published = yield from self.learn_in_imagination()  # 8-16
             sampled = self.collect_real_episodes(published)  # 17, 19, 20
@@ -215,10 +233,11 @@ class LaterMember:
         progress, plan = self.progress, rules.plan_imagination(self.progress.rounds, self.phase)
         scores = progress.strength.scores()  # 9
         starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
+        tally = self.work.tally(self.member).result() if rules.goes_by_tally(self.config.discovery) else None
         done, best = plan.done, progress.best_shown
         while True:
             count = min(AGENT_PIECE, plan.done + plan.updates - done)
-            task = AgentTask(count, model, starts, plan.new_share, scores, progress.plays)
+            task = AgentTask(count, model, starts, plan.new_share, scores, progress.plays, tally)
             update = self.work.update_agent(task).result()  # 11-15
             figures = named_figures("agent", update.metrics) | {"updates": done}
             shown = {"steps": progress.steps, "entropy": round(update.metrics["entropy"], 2), **best}

@@ -10,6 +10,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import MemberWeights
+from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.start_states import Starts
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match
@@ -17,12 +18,32 @@ from popgen.play.matches import Match
 
 @dataclass(frozen=True)
 class ModelUpdate:
-    """Of the world model: handles of its weights and of start states from the training windows (None if not asked
-    for), mean metrics."""
+    """Of the world model: handles of its weights, of start states from the training windows and of such from the last
+    rows of self-play (None if not asked for), mean metrics."""
 
     weights: Pending[Weights]
     starts: Pending[Starts] | None
     metrics: dict[str, float]
+    recent: Pending[Starts] | None = None
+
+
+@dataclass(frozen=True)
+class ModelTask:
+    """Updates of the world model.
+
+    Attributes:
+        updates: how many.
+        starts_per_update: start states from each update's windows.
+        chosen: also from windows that were drawn for an event.
+        rare: events of which none happened before a start state in its window.
+        recent_rows: last rows of self-play from which further start states are taken, evenly; 0 for none.
+    """
+
+    updates: int
+    starts_per_update: int = 0
+    chosen: bool = True
+    rare: tuple[int, ...] = ()
+    recent_rows: int = 0
 
 
 @dataclass(frozen=True)
@@ -36,6 +57,8 @@ class AgentTask:
         new_share: share of the starts from this member's own data.
         partner_scores: each partner's return in real cross-play, of those seen.
         plays: real self-play has begun.
+        tally: of real play, where anything goes by it.
+        recent: states of this member's latest self-play; None: those among `starts`.
     """
 
     updates: int
@@ -44,6 +67,8 @@ class AgentTask:
     new_share: float
     partner_scores: dict[int, float]
     plays: bool
+    tally: Tally | None = None
+    recent: Pending[Starts] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,9 +108,12 @@ class Workers(Protocol):
         """One sampler plays on, with new weights of one member."""
         ...
 
-    def update_world_model(self, updates: int, starts_per_update: int, chosen: bool = True) -> Pending[ModelUpdate]:
-        """Gradient steps on windows from both buffers (lines 6 and 7), with start states from those windows: also from
-        those chosen for an event, or not."""
+    def update_world_model(self, task: ModelTask) -> Pending[ModelUpdate]:
+        """Gradient steps on windows from both buffers (lines 6 and 7), with start states from those windows."""
+        ...
+
+    def tally(self, member: int) -> Pending[Tally]:
+        """What the self-play buffer has taken in so far, with `member` as the present one."""
         ...
 
     def cache_starts(self) -> Pending[Starts]:

@@ -101,6 +101,12 @@ class PlayerDecoder(nn.Module):
         """The last bias, one number for each of the observation's."""
         return _last_bias(self.trunk) if self.conv is None else self.conv.bias
 
+    def entries(self, inputs: Tensor, columns: Tensor) -> Tensor:
+        """Some entries (..., N) of a flat observation, of inputs (..., D + C * G)."""
+        last = self.trunk[-1]
+        assert isinstance(last, nn.Linear)
+        return F.linear(self.trunk[:-1](inputs), last.weight[columns], last.bias[columns])
+
     def forward(self, inputs: Tensor) -> Tensor:
         """(B, D + C * G) -> (B, *shape)."""
         hidden = self.trunk(inputs)
@@ -303,15 +309,14 @@ class WorldModel(nn.Module):
         """(..., P * E), player-major."""
         return self.event_head(latent.flat())
 
-    def reward(self, latent: Latent) -> Float[Tensor, "*batch"]:
-        """Joint reward (...): w . p(r | h, z), summed over players (paper, "event-based rewards").
-
-        With `imagination=mode` an event less likely than not counts for nothing.
-        """
+    def event_probs(self, latent: Latent) -> Float[Tensor, "*batch PE"]:
+        """p(r | h, z), player-major; with `imagination=mode` an event less likely than not counts for nothing."""
         probs = torch.sigmoid(self.event_logits(latent))
-        if self.config.imagination == "mode":
-            probs = probs * (probs > 0.5)
-        return (probs * self.event_weights).sum(-1)
+        return probs * (probs > 0.5) if self.config.imagination == "mode" else probs
+
+    def reward(self, latent: Latent) -> Float[Tensor, "*batch"]:
+        """Joint reward (...): w . p(r | h, z), summed over players (paper, "event-based rewards")."""
+        return (self.event_probs(latent) * self.event_weights).sum(-1)
 
     def continuation(self, latent: Latent) -> Float[Tensor, "*batch"]:
         """Probability (...) that the episode continues from this state."""

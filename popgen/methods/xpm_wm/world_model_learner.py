@@ -176,14 +176,25 @@ class ModelLearner:
         return self.model.observe(batch.obs, batch.actions, batch.is_first, self.generator)
 
     def starts(
-        self, seen: Observed, windows: Windows, count: int, *, pool: int, skip: int = 1, chosen: bool = True
+        self,
+        seen: Observed,
+        windows: Windows,
+        count: int,
+        *,
+        pool: int,
+        skip: int = 1,
+        chosen: bool = True,
+        rare: tuple[int, ...] = (),
     ) -> Starts:
         """`count` random states of the windows, neither terminal nor among the first `skip` of their window; with
-        `chosen` false, none of a window that was drawn for an event, if there are others."""
+        `chosen` false, none of a window that was drawn for an event, if there are others, and none that an event of
+        `rare` precedes in its window or led to."""
         allowed = ~np.ascontiguousarray(windows.terminal.T)
         allowed[:skip] = False
         if not chosen and not windows.chosen.all():
             allowed[:, windows.chosen] = False
+        if rare and (known := allowed & ~before_or_at(windows, rare).T).any():
+            allowed = known
         steps, rows = np.nonzero(allowed)
         picked = self.rng.integers(0, len(steps), size=count)
         t, b = steps[picked], rows[picked]
@@ -209,3 +220,11 @@ class ModelLearner:
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
         self.rng.bit_generator.state = state["rng"]
         self.updates = int(state["updates"])
+
+
+def before_or_at(windows: Windows, events: tuple[int, ...]) -> np.ndarray:
+    """(N, L) bool: one of the events led to this state or to an earlier one of the window; what led to the first is not
+    looked at."""
+    happened = windows.events[..., list(events)].any((2, 3))
+    happened[:, 0] = False
+    return np.maximum.accumulate(happened, axis=1)

@@ -1,0 +1,124 @@
+"""What real play has shown so far: how often each event, and how often a player was in each state of its own.
+
+A player's own state is read off the entries that a view declares as its own (`ViewSpec.own`): in a kitchen cell,
+orientation and held object. It is kept as a number, a random projection of those entries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from popgen.envs.contract import BatchedEnv, ViewSpec
+from popgen.types import Kind, Segment
+
+_LARGEST = 2**62
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Of all real self-play and random play.
+
+    Attributes:
+        events: (E,) int64, how often each happened to either player.
+        own_events: (E,) int64, the same in the present member's self-play alone.
+        own_steps: environment steps of that.
+        keys: (K,) int64, ascending: players' own states that were seen.
+        visits: (K,) int64, how often each.
+        known: for each part of `ViewSpec.own`, (N,) int64, ascending: the values of that part that were seen.
+    """
+
+    events: np.ndarray
+    own_events: np.ndarray
+    own_steps: int
+    keys: np.ndarray
+    visits: np.ndarray
+    known: tuple[np.ndarray, ...]
+
+    def to_state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        arrays = {"events": self.events, "own_events": self.own_events, "keys": self.keys, "visits": self.visits}
+        known = {str(part): values for part, values in enumerate(self.known)}
+        return arrays | {"own_steps": self.own_steps, "known": known}
+
+    @staticmethod
+    def from_state(state: dict[str, Any]) -> Tally:
+        """From `to_state()`, as it was read."""
+        arrays = (np.asarray(state[name], np.int64) for name in ("events", "own_events"))
+        table = (np.asarray(state[name], np.int64) for name in ("keys", "visits"))
+        known = tuple(np.asarray(state["known"][str(part)], np.int64) for part in range(len(state["known"])))
+        return Tally(*arrays, int(state["own_steps"]), *table, known)
+
+
+def part_weights(view: ViewSpec) -> tuple[np.ndarray, ...]:
+    """For each part of a player's own entries, (N,) int64: their sum over the entries that are set is its value, and
+    the sum of the parts' values the key of the state. The same for everyone who asks."""
+    rng = np.random.default_rng(0)
+    return tuple(rng.integers(1, _LARGEST, len(part), dtype=np.int64) for part in view.own)
+
+
+class TallyKeeper:
+    """Counts segments as they arrive.
+
+    Args:
+        env: encodes states.
+        view: whose own states are counted; "" counts events alone.
+    """
+
+    def __init__(self, env: BatchedEnv, view: str) -> None:
+        self.env, self.view = env, view
+        self.parts = env.spec.views[view].own if view else ()
+        self.weights = part_weights(env.spec.views[view]) if view else ()
+        self.events: dict[tuple[int, str], np.ndarray] = {}
+        self.steps: dict[tuple[int, str], int] = {}
+        self.visits: dict[int, int] = {}
+        self.known: list[set[int]] = [set() for _ in self.parts]
+
+    def add(self, segment: Segment, owner: int) -> None:
+        """Count a segment that was played for `owner`."""
+        key = (owner, str(segment.kind))
+        seen = segment.events.sum((0, 1, 2), dtype=np.int64)
+        self.events[key] = self.events.get(key, np.zeros_like(seen)) + seen
+        self.steps[key] = self.steps.get(key, 0) + segment.steps
+        if self.parts:
+            self._count_states(segment.states)
+
+    def _count_states(self, states: np.ndarray) -> None:
+        obs = self.env.encode(states.reshape(-1, states.shape[-1]), self.view).reshape(-1, *self._shape())
+        parts = zip(self.parts, self.weights, strict=True)
+        values = [(obs[:, list(part)] > 0).astype(np.int64) @ weights for part, weights in parts]
+        for known, value in zip(self.known, values, strict=True):
+            known.update(np.unique(value).tolist())
+        for key, count in zip(*np.unique(np.sum(values, 0), return_counts=True), strict=True):
+            self.visits[int(key)] = self.visits.get(int(key), 0) + int(count)
+
+    def _shape(self) -> tuple[int, ...]:
+        return self.env.spec.views[self.view].shape
+
+    def tally(self, owner: int) -> Tally:
+        """So far, with `owner` as the present member."""
+        none = np.zeros(self.env.spec.num_events, np.int64)
+        own = (owner, str(Kind.SP))
+        keys = np.array(sorted(self.visits), np.int64)
+        visits = np.array([self.visits[int(key)] for key in keys], np.int64)
+        known = tuple(np.array(sorted(part), np.int64) for part in self.known)
+        total = sum(self.events.values(), none)
+        return Tally(total, self.events.get(own, none), self.steps.get(own, 0), keys, visits, known)
+
+    def state(self) -> dict[str, Any]:
+        """Everything counted."""
+        return {
+            "events": [[owner, kind, counts.tolist()] for (owner, kind), counts in self.events.items()],
+            "steps": [[owner, kind, steps] for (owner, kind), steps in self.steps.items()],
+            "visits": np.array(list(self.visits.items()), np.int64).reshape(-1, 2),
+            "known": [sorted(part) for part in self.known],
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Replace the contents with `state()`."""
+        self.events = {(int(o), str(kind)): np.array(counts, np.int64) for o, kind, counts in state["events"]}
+        self.steps = {(int(o), str(kind)): int(steps) for o, kind, steps in state["steps"]}
+        self.visits = {int(key): int(count) for key, count in np.asarray(state["visits"]).tolist()}
+        self.known = [set(map(int, part)) for part in state["known"]]
