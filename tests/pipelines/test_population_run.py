@@ -22,11 +22,12 @@ from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.methods.training import Collected, Round, TrainedMember
-from popgen.methods.transport import InlineTransport
+from popgen.methods.transport import InlineTransport, Ready
 from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress
+from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.replay import KIND_CODE
 from popgen.methods.xpm_wm.train import FirstMember, LaterMember
-from popgen.methods.xpm_wm.workers import Setup
+from popgen.methods.xpm_wm.workers import ModelTask, Setup
 from popgen.pipelines import population as main_job
 from popgen.pipelines.population import run_population
 from popgen.play.partner_strength import PartnerStrength
@@ -85,9 +86,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
-    """`scale=smoke` with two members, the second of two rounds, and short episodes."""
+    """`scale=smoke` with two members, the second of two rounds, short episodes, and all that goes by real play's counts."""
     base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
-    base += ["phase2.rounds=2", f"run.root={root}", f"run.id={name}"]
+    base += ["phase2.rounds=2", f"run.root={root}", f"run.id={name}", "agent.advantage_clip=5", "phase1.plateau=2"]
+    base += [f"discovery.{option}" for option in ("count_bonus=1", "trust=2", "rare_events=9", "found_events=1")]
     return RunConfig.parse(compose([*base, *overrides]))
 
 
@@ -401,12 +403,15 @@ def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
     root: Path, event_starts: str, plays: bool, chosen: bool
 ) -> None:
     config = smoke(root, "unused", f"phase1.event_starts={event_starts}")
-    asked: list[tuple[Any, ...]] = []
-    work: Any = SimpleNamespace(update_world_model=lambda *arguments: asked.append(arguments))
+    asked: list[ModelTask] = []
+    none = np.zeros(0, np.int64)
+    tally = Tally(np.array([9, 8, 9, 9, 0]), np.zeros(5, np.int64), 0, none, none, ())
+    work: Any = SimpleNamespace(update_world_model=asked.append, tally=lambda member: Ready(tally))
     progress = FirstMemberProgress(16, plays=plays)
     spec = make_env(config.env.name, 1).spec
     FirstMember(Setup(work, config, spec, 1, 0, {}), progress).update_world_model(7)
-    assert asked == [(7, config.agent.starts_sp, chosen)]
+    rows = config.phase1.envs * config.phase1.steps_per_iteration
+    assert asked == [ModelTask(7, config.agent.starts_sp, chosen, (1, 4), rows)]
 
 
 def test_every_look_at_the_last_policy_has_fresh_episodes(root: Path) -> None:

@@ -7,7 +7,7 @@ By REINFORCE, as in the paper, or by PPO's clipped surrogate in several passes o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,14 +17,14 @@ from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec
 from popgen.methods.xpm_wm.actor_critic import Actor
-from popgen.methods.xpm_wm.agent_networks import SELF, AgentNetworks
+from popgen.methods.xpm_wm.agent_networks import AgentNetworks
 from popgen.methods.xpm_wm.agent_schedules import cross_play_weight, entropy_scale
 from popgen.methods.xpm_wm.agent_targets import (
     PolicyTarget,
     cross_play_target,
-    sample_losses,
     self_play_target,
 )
+from popgen.methods.xpm_wm.batch_learning import cast_automatically, learn_batch
 from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig, WorldModelConfig
 from popgen.methods.xpm_wm.discovery import Discovery
 from popgen.methods.xpm_wm.imagination import Imagined, JointActor, expected_pay, imagine
@@ -35,8 +35,8 @@ from popgen.methods.xpm_wm.imagined_play import (
     joint_actor,
     start_latents,
 )
+from popgen.methods.xpm_wm.latents import Latent
 from popgen.methods.xpm_wm.play_tally import Tally
-from popgen.methods.xpm_wm.policy_samples import Samples
 from popgen.methods.xpm_wm.start_states import NEW_SP, Starts
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
@@ -136,21 +136,18 @@ class AgentLearner:
         partner = self.choose_partner()
         imagined, seats = self.imagine_play(partner)
         count = self.config.starts_sp
-        with self._cast_automatically():
+        with cast_automatically(self.networks):
             own = self.self_play(imagined.of_columns(slice(None, count)))
             targets = [own]
             if partner is not None:
                 targets.append(self.cross_play(imagined.of_columns(slice(count, None)), partner, seats, own.unit))
         figures = {name: value for target in targets for name, value in target.figures.items()}
-        figures |= self._learn_batch([target.samples for target in targets])
+        figures |= learn_batch(self.networks, [target.samples for target in targets], self.generator)
         self.networks.update_copies()
         self.updates += 1
         self.playing += self.plays
         self.finding += self.discovery.found()
         return figures
-
-    def _cast_automatically(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16)
 
     def lambda_now(self) -> float:
         """lambda_XP of this update."""
@@ -171,9 +168,13 @@ class AgentLearner:
         act = joint_actor(self.networks.rollout_actor, other, config.starts_sp, seats, self.generator)
         return ImaginedPlay(self._imagine(act, rows), seats)
 
-    def _imagine(self, act: JointActor, rows: np.ndarray) -> Imagined:
+    def start_states(self, rows: np.ndarray) -> Latent:
+        """Stored states as the world model's."""
         assert self.starts is not None
-        start = start_latents(self.starts, rows, self.model_config.classes, self.device, self.dtype)
+        return start_latents(self.starts, rows, self.model_config.classes, self.device, self.dtype)
+
+    def _imagine(self, act: JointActor, rows: np.ndarray) -> Imagined:
+        start = self.start_states(rows)
         pay = self.discovery.pay if self.discovery.changes_pay else expected_pay
         return imagine(self.model, act, start, self.config.horizon, self.generator, pay)
 
@@ -222,28 +223,6 @@ class AgentLearner:
         reward = target.figures["imagined_shaped_xp"]
         self.imagined_scores[partner] = 0.95 * self.imagined_scores.get(partner, reward) + 0.05 * reward
         return target
-
-    # ---- losses --------------------------------------------------------------------------------------------------
-
-    def _learn_batch(self, samples: Sequence[Samples]) -> dict[str, float]:
-        """`epochs` passes over the batch in `minibatches`, of every kind of samples its share; mean figures."""
-        config, totals = self.config, []
-        for _ in range(config.epochs):
-            parts = [part.minibatches(config.minibatches, self.generator) for part in samples]
-            totals += [self._step_networks(together) for together in zip(*parts, strict=True)]
-        return {name: float(np.mean([figures[name] for figures in totals])) for name in totals[0]}
-
-    def _step_networks(self, parts: Sequence[Samples]) -> dict[str, float]:
-        """One step of the actor and of the critics that the samples are of."""
-        with self._cast_automatically():
-            losses = [sample_losses(self.networks, part) for part in parts]
-        zero = torch.zeros((), device=self.device)
-        self.networks.step_actor(sum((loss.policy for loss in losses), zero))
-        self.networks.step_critics(sum((loss.critic for loss in losses), zero))
-        figures = losses[0].figures  # of the policy in self-play
-        for part, loss in zip(parts, losses, strict=True):
-            figures["critic_loss_sp" if part.key == SELF else "critic_loss_xp"] = float(loss.critic.detach())
-        return figures
 
     # ---- what is kept --------------------------------------------------------------------------------------------
 

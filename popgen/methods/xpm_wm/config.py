@@ -267,6 +267,11 @@ class Phase1Config(Schema):
     """Mean self-play score of the latest episodes that ends phase 1 earlier."""
     patience: Positive = 1000
     """Rounds without a better mean score that end phase 1 earlier."""
+    plateau: NonNegative = 0
+    """Once self-play has begun, the phase ends after so many rounds without a gain of `least_gain`, not at the target;
+    0: it ends at the target."""
+    least_gain: Fraction = 0.02
+    """Share by which a window must exceed the last that counted as a gain."""
 
 
 class Phase2Config(Schema):
@@ -292,6 +297,9 @@ class Phase2Config(Schema):
     """Self-play score below which a member gets further rounds, up to `max_rounds`."""
     max_steps: Positive | None = None
     """Environment steps, SP and XP, of each member, if they end before its rounds; null: no such bound."""
+    plateau: NonNegative = 0
+    """A member goes on after `rounds`, until so many rounds were no better than its best, to `max_rounds` at most;
+    0: it goes on only while its self-play is below the target."""
     cache: Positive = 8192
     """States from which one round's imagination starts, before those of the member's own data."""
     starts_random: Fraction = 0.6
@@ -355,6 +363,7 @@ class XpmWmRun(RunConfig):
     phase2: Phase2Config = Phase2Config()
     """Later members, mostly in imagination."""
     discovery: DiscoveryConfig = DiscoveryConfig()
+    """What finds rare rewards and distrusts made-up ones."""
 
     @model_validator(mode="after")
     def _check_windows(self) -> XpmWmRun:

@@ -80,6 +80,7 @@ class FirstMemberProgress:
         steps: environment steps so far.
         rounds: that have ended.
         since_best: rounds since the best window, once there was one.
+        mark, since_gain: the window that last counted as a gain, and the rounds since, once self-play has begun.
         confirmations: how often the last policy has been looked at by itself.
         restarted: actor and critics have started again.
         plays: self-play has begun (`agent.entropy_after` of the target).
@@ -95,6 +96,8 @@ class FirstMemberProgress:
     steps: int = 0
     rounds: int = 0
     since_best: int = 0
+    mark: float = 0.0
+    since_gain: int = 0
     confirmations: int = 0
     restarted: bool = False
     plays: bool = False
@@ -135,6 +138,8 @@ class FirstMemberProgress:
         return {
             "rounds": self.rounds,
             "since_best": self.since_best,
+            "mark": self.mark,
+            "since_gain": self.since_gain,
             "confirmations": self.confirmations,
             "restarted": self.restarted,
             "plays": self.plays,
@@ -156,6 +161,8 @@ class FirstMemberProgress:
             steps,
             rounds=int(state["rounds"]),
             since_best=int(state["since_best"]),
+            mark=float(state["mark"]),
+            since_gain=int(state["since_gain"]),
             confirmations=int(state["confirmations"]),
             restarted=bool(state["restarted"]),
             plays=bool(state["plays"]),
@@ -177,7 +184,7 @@ class LaterMemberProgress:
     Attributes:
         strength: each partner's returns in real cross-play.
         steps: environment steps so far.
-        rounds: of real episodes that have ended.
+        rounds: of real episodes that have ended; since_best: since the best of them.
         plays: self-play has begun (`agent.entropy_after` of the target).
         best: the policy of the best round.
         figures: of the last round.
@@ -189,6 +196,7 @@ class LaterMemberProgress:
     plays: bool = False
     best: Candidate | None = None
     figures: dict[str, float] = field(default_factory=dict)
+    since_best: int = 0
 
     @property
     def best_shown(self) -> dict[str, float]:
@@ -201,6 +209,7 @@ class LaterMemberProgress:
         return {
             "rounds": self.rounds,
             "plays": self.plays,
+            "since_best": self.since_best,
             "best": self.best.to_state(),
             "strength": self.strength.state(),
         }
@@ -210,7 +219,8 @@ class LaterMemberProgress:
         """From `to_state()`, as it was read."""
         strength.load_state(state["strength"])
         best = Candidate.from_state(state["best"], put)
-        return LaterMemberProgress(strength, steps, int(state["rounds"]), bool(state["plays"]), best)
+        rounds, plays = int(state["rounds"]), bool(state["plays"])
+        return LaterMemberProgress(strength, steps, rounds, plays, best, since_best=int(state["since_best"]))
 
 
 # ---- what real play has shown ----------------------------------------------------------------------------------------
@@ -244,10 +254,19 @@ def reached_target(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
     return has_full_window(progress) and mean_score(progress) >= phase.target_score
 
 
+def has_levelled_off(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
+    """Plays, and has not gained for `plateau` rounds."""
+    return progress.plays and 0 < phase.plateau <= progress.since_gain
+
+
+def is_done(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
+    """No longer improves, or where that does not matter has reached the target: the last policy is to be looked at."""
+    return has_levelled_off(progress, phase) if phase.plateau else reached_target(progress, phase)
+
+
 def should_stop(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
-    """Budget spent, target reached, or no better for `patience` rounds."""
-    spent = progress.steps >= phase.max_steps
-    return spent or reached_target(progress, phase) or progress.since_best >= phase.patience
+    """Budget spent, done, or no better for `patience` rounds."""
+    return progress.steps >= phase.max_steps or is_done(progress, phase) or progress.since_best >= phase.patience
 
 
 def restart_is_due(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
@@ -261,16 +280,18 @@ def may_confirm(progress: FirstMemberProgress, phase: Phase1Config, horizon: int
     return progress.steps + phase.envs * horizon <= phase.max_steps
 
 
-def is_confirmed(score: float, phase: Phase1Config) -> bool:
+def is_confirmed(score: float, wanted: float) -> bool:
     """Whether a policy that scored so by itself is good enough: a window's episodes are of several policies."""
-    return score >= CONFIRMED * phase.target_score
+    return score >= CONFIRMED * wanted
 
 
 def confirm_policy(progress: FirstMemberProgress, episodes: Sequence[Episode], phase: Phase1Config) -> float:
-    """Whole episodes of the last policy alone: its score, and whether that confirms it."""
+    """Whole episodes of the last policy alone: its score, and whether that confirms it, which takes the target or, with
+    a plateau, the window that last counted as a gain. If not, gains are waited for anew."""
     progress.add_episodes(episodes)
     score = float(np.mean([episode.score for episode in episodes]))
-    progress.confirmed = is_confirmed(score, phase)
+    progress.confirmed = is_confirmed(score, progress.mark if phase.plateau else phase.target_score)
+    progress.since_gain = 0
     return score
 
 
@@ -287,11 +308,21 @@ def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after:
         return
     score = mean_score(progress)
     progress.plays |= score >= entropy_after * phase.target_score
+    count_gain(progress, score, phase)
     if progress.best is None or score > progress.best.sp:
         assert progress.played is not None
         progress.best, progress.since_best = Candidate(progress.played, score, 0.0), 0
     else:
         progress.since_best += 1
+
+
+def count_gain(progress: FirstMemberProgress, score: float, phase: Phase1Config) -> None:
+    """Of a full window, once self-play has begun."""
+    if not progress.plays:
+        return
+    progress.since_gain += 1
+    if score >= (1.0 + phase.least_gain) * progress.mark:
+        progress.mark, progress.since_gain = score, 0
 
 
 def choose_first(progress: FirstMemberProgress) -> Candidate:
@@ -310,9 +341,11 @@ def most_rounds(phase: Phase2Config, episodes_xp: int, horizon: int) -> int:
 
 
 def plays_on(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> bool:
-    """The configured rounds are played in any case, further ones only by a member that is still weak."""
+    """The configured rounds are played in any case, further ones only by a member that is still weak or, with a
+    plateau, improves."""
     weak = progress.best is None or progress.best.sp < phase.target_score
-    return progress.rounds < (most if weak else min(phase.rounds, most))
+    goes_on = weak or progress.since_best < phase.plateau
+    return progress.rounds < (most if goes_on else min(phase.rounds, most))
 
 
 def judge_round(
@@ -326,8 +359,9 @@ def judge_round(
         progress.strength.add(partner, [e.shaped for e in met])
     strongest = max(float(np.mean([e.score for e in met])) for met in cross.values())
     candidate = Candidate(published, float(np.mean([e.score for e in own])), strongest)
+    progress.since_best += 1
     if progress.best is None or candidate.merit > progress.best.merit:
-        progress.best = candidate
+        progress.best, progress.since_best = candidate, 0
     progress.rounds += 1
     progress.figures = {
         "real_sp": candidate.sp,

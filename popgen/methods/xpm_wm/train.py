@@ -56,7 +56,7 @@ class FirstMember:
         overlap = Overlap.of_run(self.config.run, self.work.samplers(), LEARNERS, self.work.wait)
         while True:
             yield from self.play_rounds(overlap)
-            if not rules.reached_target(self.progress, self.phase) or (yield from self.confirm()):
+            if not rules.is_done(self.progress, self.phase) or (yield from self.confirm()):
                 return rules.choose_first(self.progress)
             self.start_self_play()
 

@@ -10,10 +10,13 @@ import pytest
 from popgen.actors.checkpoint_writer import resolve_handles
 from popgen.methods.transport import InlineTransport, Ready
 from popgen.methods.xpm_wm import member_progress as rules
-from popgen.methods.xpm_wm.config import Phase1Config, Phase2Config
+from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
+from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.start_states import Starts
+from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerStrength
+from popgen.types import Kind
 
 AFTER = 0.5
 
@@ -92,7 +95,7 @@ def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_targ
 def test_the_last_policy_must_reach_the_target_by_itself() -> None:
     """9.69 of 10 is too little, 9.7 enough; then it is taken although the best window was another's."""
     phase = Phase1Config(target_score=10.0)
-    assert not rules.is_confirmed(9.69, phase) and rules.is_confirmed(9.7, phase)
+    assert not rules.is_confirmed(9.69, 10.0) and rules.is_confirmed(9.7, 10.0)
     first = member()
     play(first, phase, *[20.0] * 16)
     first.add_scores([9.7] * 16, [])
@@ -100,6 +103,35 @@ def test_the_last_policy_must_reach_the_target_by_itself() -> None:
     first.confirmed = True
     chosen = rules.choose_first(first)
     assert chosen.weights is LATEST and chosen.sp == pytest.approx(9.7)
+
+
+def test_with_a_plateau_a_member_goes_on_past_its_target_until_it_no_longer_gains() -> None:
+    """Windows of 10.0, 10.1 and 10.19 are no gains of 2 % over 10.0; 10.2 is one."""
+    first, phase = member(), Phase1Config(target_score=10.0, plateau=3)
+    play(first, phase, *[4.0] * 16)
+    assert (first.mark, first.since_gain, first.plays) == (0.0, 0, False)
+    for score, since in ((10.0, 0), (10.1, 1), (10.19, 2), (10.2, 0), (10.2, 1), (10.2, 2)):
+        play(first, phase, *[score] * 16)
+        assert (first.since_gain, rules.should_stop(first, phase)) == (since, False)
+    play(first, phase, *[10.2] * 16)
+    assert rules.has_levelled_off(first, phase) and rules.should_stop(first, phase)
+
+
+def test_a_member_that_does_not_play_has_not_levelled_off() -> None:
+    first, phase = member(), Phase1Config(target_score=10.0, plateau=1)
+    for _ in range(5):
+        play(first, phase, *[4.9] * 16)
+    assert not rules.should_stop(first, phase)
+
+
+def test_a_plateaus_policy_is_measured_by_its_own_best_and_waits_anew_if_it_fails() -> None:
+    phase = Phase1Config(target_score=20.0, plateau=2)
+    for score, taken in ((9.7, True), (9.69, False)):
+        first = member()
+        first.plays, first.mark, first.since_gain = True, 10.0, 2
+        episodes = [Episode(Kind.SP, (1, 1), score, score)] * 16
+        assert rules.confirm_policy(first, episodes, phase) == pytest.approx(score)
+        assert first.confirmed is taken and not rules.is_done(first, phase)
 
 
 def test_a_confirmation_needs_room_in_the_budget() -> None:
@@ -136,6 +168,24 @@ def test_only_a_weak_member_plays_further_rounds() -> None:
         assert progress.rounds == wanted
 
 
+def test_with_a_plateau_a_later_member_goes_on_while_it_improves() -> None:
+    phase = Phase2Config(rounds=2, max_rounds=6, target_score=5.0, plateau=2)
+    for last_best, wanted in ((1, 3), (2, 4), (3, 5), (5, 6)):
+        progress = LaterMemberProgress(PartnerStrength("max_window"), best=Candidate(LATEST, 5.0, 0.0))
+        while rules.plays_on(progress, phase, 6):
+            progress.rounds += 1
+            progress.since_best = max(0, progress.rounds - last_best)
+        assert progress.rounds == wanted
+
+
+def test_rare_events_are_those_seen_too_seldom() -> None:
+    none = np.zeros(0, np.int64)
+    tally = Tally(np.array([7, 3, 0]), np.zeros(3, np.int64), 0, none, none, ())
+    assert rules.rare_events(tally, DiscoveryConfig(rare_events=4)) == (1, 2)
+    assert rules.rare_events(tally, DiscoveryConfig()) == () == rules.rare_events(None, DiscoveryConfig(rare_events=4))
+    assert not rules.goes_by_tally(DiscoveryConfig()) and rules.goes_by_tally(DiscoveryConfig(trust=2.0))
+
+
 def test_a_member_is_chosen_by_self_play_less_strongest_cross_play() -> None:
     assert Candidate(LATEST, 5.0, 3.5).merit == 1.5
 
@@ -149,21 +199,26 @@ def test_progress_of_member_1_comes_back_from_a_checkpoint() -> None:
     first, phase = member(), Phase1Config(target_score=4.0)
     play(first, phase, *map(float, range(20)))
     first.rounds, first.confirmations, first.restarted, first.figures = 7, 2, True, {"model/loss": 0.5}
+    first.mark, first.since_gain = 4.5, 2
+    first.recent_starts = Ready(Starts(*(np.ones((1, 2)) for _ in range(4))))
     first.model, first.starts = Ready({"m": np.ones(3)}), Ready(Starts(*(np.zeros((2, 2)) for _ in range(4))))
     again = FirstMemberProgress.from_state(saved(first), 16, 40, InlineTransport().put)
     assert again.steps == 40 and again.played is None  # set when the first sampler starts
-    for name in ("rounds", "since_best", "confirmations", "restarted", "plays", "recent", "shaped", "figures"):
+    counters = ("rounds", "since_best", "confirmations", "restarted", "plays", "mark", "since_gain")
+    for name in (*counters, "recent", "shaped", "figures"):
         assert getattr(again, name) == getattr(first, name)
     assert again.recent.maxlen == 16 and again.plays
     assert again.best is not None and first.best is not None and again.best.sp == first.best.sp
     assert np.array_equal(again.best.weights.acting.result()["w"], [2.0, 2.0])
     assert isinstance(again.starts.result(), Starts)  # type: ignore[union-attr]
+    assert np.array_equal(again.recent_starts.result().h, np.ones((1, 2)))  # type: ignore[union-attr]
 
 
 def test_progress_of_a_later_member_comes_back_from_a_checkpoint() -> None:
-    later = LaterMemberProgress(PartnerStrength("max_window"), rounds=3, plays=True, best=Candidate(LATEST, 4.0, 1.0))
+    best = Candidate(LATEST, 4.0, 1.0)
+    later = LaterMemberProgress(PartnerStrength("max_window"), rounds=3, plays=True, best=best, since_best=2)
     later.strength.add(1, [2.0, 4.0])
     strength = PartnerStrength("max_window")
     again = LaterMemberProgress.from_state(saved(later), strength, 160, InlineTransport().put)
-    assert (again.rounds, again.plays, again.steps) == (3, True, 160)
+    assert (again.rounds, again.plays, again.steps, again.since_best) == (3, True, 160, 2)
     assert again.strength.scores() == {1: 3.0} and again.best is not None and again.best.merit == 3.0
