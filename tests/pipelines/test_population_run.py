@@ -86,7 +86,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
-    """`scale=smoke` with two members, the second of two rounds, short episodes, and all that goes by real play's counts."""
+    """`scale=smoke`, two members, two rounds of the second, short episodes, all that goes by real play's counts."""
     base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
     base += ["phase2.rounds=2", f"run.root={root}", f"run.id={name}", "agent.advantage_clip=5", "phase1.plateau=2"]
     base += [f"discovery.{option}" for option in ("count_bonus=1", "trust=2", "rare_events=9", "found_events=1")]
