@@ -10,6 +10,8 @@ import ray
 
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.runs.interruption import end_on_sigterm
+from popgen.runs.ray_folder import make_ray_folder
 from popgen.runs.resources import demands, total
 
 STARTS = 4
@@ -25,7 +27,9 @@ def start_ray(config: RunConfig) -> bool:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     cluster, wanted = config.cluster, total(demands(config)).get("CPU", 0.0)
     local = cluster.address is None
-    limits = {"object_store_memory": cluster.object_store_bytes} if local and cluster.object_store_bytes else {}
+    limits: dict[str, Any] = (
+        {"object_store_memory": cluster.object_store_bytes} if local and cluster.object_store_bytes else {}
+    )
     arguments = {
         # Without an address Ray would look for a running cluster before it starts a local one.
         "address": "local" if local else cluster.address,
@@ -35,6 +39,8 @@ def start_ray(config: RunConfig) -> bool:
         "log_to_driver": False,
         "logging_level": "ERROR",
     }
+    if local and (folder := make_ray_folder()):
+        limits["_temp_dir"] = folder
     try:
         _start_with_patience(arguments | limits)
     except ConnectionError as error:
@@ -51,6 +57,7 @@ def _start_with_patience(arguments: dict[str, Any]) -> None:
     for _ in range(STARTS):
         try:
             ray.init(**arguments)
+            end_on_sigterm()
             return
         except Exception as error:  # Ray raises that very class
             if LATE not in str(error):

@@ -42,12 +42,14 @@ class TrackerActor:
         self.tracker = Tracker(config, run_dir, run_name, params, resume)
 
     def call(self, method: str, *arguments: Any) -> None:
-        """A method of the `Tracker`."""
-        getattr(self.tracker, method)(*arguments)
+        """A method of the `Tracker`; nothing where no store was opened."""
+        if self.tracker is not None:
+            getattr(self.tracker, method)(*arguments)
 
     def flush(self) -> dict[str, Any]:
-        """Write everything buffered; what a later tracker needs to go on."""
-        assert self.tracker is not None
+        """Write everything buffered; what a later tracker needs to go on, nothing where no store was opened."""
+        if self.tracker is None:
+            return {}
         self.tracker.flush()
         return self.tracker.state()
 

@@ -9,11 +9,12 @@ from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.progress import Reporter
 from popgen.reports.run_record import is_finished
+from popgen.runs.directory import describe_settings
 
 
 def named(config: RunConfig, root: Path) -> RunConfig:
     """The same run in `root`, under an id that its settings decide: the same command finds it again."""
-    name = config.run.id or f"{config.method}-{Path(config.env.name).stem}-s{config.run.seed}-{config.digest()[:8]}"
+    name = config.run.id or f"{describe_settings(config)}-{config.digest()[:8]}"
     return config.model_copy(update={"run": config.run.model_copy(update={"root": str(root), "id": name})})
 
 

@@ -177,7 +177,7 @@ class RichReporter:
 
     def note(self, text: str) -> None:
         """See `Reporter.note`."""
-        self._progress.console.print(text, markup=False, highlight=False)
+        self._progress.console.print(text, markup=False, highlight=False, emoji=False)
 
     def close(self) -> None:
         """See `Reporter.close`."""

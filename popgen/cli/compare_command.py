@@ -51,7 +51,7 @@ def compare(args: argparse.Namespace) -> int:
     from popgen.pipelines.compare import EXPERIMENT, compare_runs
     from popgen.progress import make_reporter
     from popgen.reports.comparison_report import to_sheets
-    from popgen.runs.mlflow_tracker import check_uri
+    from popgen.runs.tracking_address import check_uri
 
     tracking = TrackingConfig(enabled=not args.no_tracking, uri=args.tracking_uri, experiment=EXPERIMENT)
     check_uri(tracking.uri)

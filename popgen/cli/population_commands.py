@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import add_command
-from popgen.cli.printing import OK, print_json, print_table, short
+from popgen.cli.printing import OK, print_json, print_table
 
 
 def add(commands: Any) -> None:
@@ -55,16 +56,25 @@ def runs(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"root": args.root, "runs": found})
         return OK
-    from rich.markup import escape
-    from rich.table import Table
+    print_table(_list_as_table(args.root, found))
+    for run in found:
+        if run["error"]:
+            print(f"{run['id']}: {run['error']}")
+    return OK
 
-    names = ("run", "state", "method", "environment", "member", "environment steps", "minutes", "last error")
-    table = Table(*names, title=f"runs in {args.root}", title_justify="left")
+
+def _list_as_table(root: str, found: Sequence[Mapping[str, Any]]) -> Any:
+    """At most 80 columns wide where the terminal is: an id is folded over lines, never cut."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(f"runs in {root}"), title_justify="left", show_lines=True)
+    for name in ("run", "state", "member", "environment steps", "minutes"):
+        table.add_column(name, overflow="fold")
     for run in found:
         member = "-" if run["size"] is None else f"{run['member']} of {run['size']}"
-        steps = ", ".join(f"{kind} {count:,}" for kind, count in run["steps"].items())
-        cells = (run["id"], run["state"], run["method"], run["environment"], member, steps)
-        error = short(" ".join((run["error"] or "").split()))
-        table.add_row(*(escape(str(cell or "-")) for cell in cells), f"{run['seconds'] / 60:.1f}", escape(error))
-    print_table(table)
-    return OK
+        steps = "\n".join(f"{kind} {count:,}" for kind, count in run["steps"].items())
+        about = f"{run['id']}\n{run['method'] or '-'}, {run['environment'] or '-'}"
+        cells = (about, run["state"], member, steps or "-", f"{run['seconds'] / 60:.1f}")
+        table.add_row(*(Text(cell) for cell in cells))
+    return table

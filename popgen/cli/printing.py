@@ -28,7 +28,10 @@ def print_table(table: Any, width: int | None = None) -> None:
     from rich.console import Console
 
     # Piped output has no width of its own; tables of many members must not be cut.
-    Console(width=width or (None if sys.stdout.isatty() else 200)).print(table)
+    console = Console(width=width or (None if sys.stdout.isatty() else 200))
+    with console.capture() as captured:  # rich ends the process where the reader went away
+        console.print(table)
+    print(captured.get(), end="")
 
 
 def print_report(

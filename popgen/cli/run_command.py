@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from popgen.config.run_config import RunConfig
     from popgen.progress import make_reporter
     from popgen.runs.directory import named, run_folder
+    from popgen.runs.interruption import end_on_sigterm
     from popgen.runs.preflight import preflight
     from popgen.runs.supervisor import guarded
 
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
         config = named(config)
         if (code := guarded(run_folder(config), config.cluster.retries)) is not None:
             return code
+        end_on_sigterm()
     preflight(config)
     if args.dry_run:
         return _print_config(config.as_dict(), args.json)

@@ -20,7 +20,7 @@ from popgen.config.sections import (
     RunSection,
     TrackingConfig,
 )
-from popgen.errors import UserError
+from popgen.errors import UserError, mask_credentials
 
 _REGISTRY = "popgen.methods.registry"
 """Module that knows each method's schema; imported by its name, since methods stand above this package."""
@@ -60,14 +60,22 @@ class RunConfig(Schema):
             raise as_user_error(error, schema=schema) from None
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return self.model_dump(mode="json")
+        """JSON-able, without credentials that addresses hold."""
+        return _mask_values(self.model_dump(mode="json"))
 
     def digest(self) -> str:
         """sha256 of everything that decides the result (not of where it runs or is tracked)."""
         kept = {k: v for k, v in self.as_dict().items() if k not in ("cluster", "tracking", "run")}
         kept["seed"], kept["schedule"] = self.run.seed, self.run.schedule
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def _mask_values(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _mask_values(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_mask_values(item) for item in value]
+    return mask_credentials(value) if isinstance(value, str) else value
 
 
 def schema_of(values: Mapping[str, Any]) -> type[RunConfig]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+from rich.text import Text
 
 from popgen.errors import UserError
 from popgen.humans.behaviour import MEASURES, Rates, compare_rates, measure_people, team_dishes
@@ -118,7 +119,7 @@ def to_tables(reports: Sequence[LayoutReport]) -> list[Table]:
 
 def _to_table(report: LayoutReport) -> Table:
     counts = ", ".join(f"{half} {report.games[half]} games {report.steps[half]:,} steps" for half in HALVES)
-    table = Table(title=f"{report.layout}: {counts}", title_justify="left")
+    table = Table(title=Text(f"{report.layout}: {counts}"), title_justify="left")
     table.add_column("in 400 steps")
     for name in ("people", "SD"):
         table.add_column(name, justify="right")

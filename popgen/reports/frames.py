@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -87,14 +86,15 @@ class Sheet:
     def to_markdown(self) -> str:
         """The table alone, without its title."""
         sides = ["left" if number < self.labels else "right" for number in range(self.frame.shape[1])]
-        return self.frame.to_markdown(index=False, disable_numparse=True, colalign=sides)
+        cells = self.frame.map(lambda cell: str(cell).replace("|", "\\|"))
+        return cells.to_markdown(index=False, disable_numparse=True, colalign=sides)
 
     def to_rich(self) -> Table:
         """For the terminal."""
-        table = Table(title=escape(self.title))
+        table = Table(title=Text(self.title))
         for number, label in enumerate(self.frame.columns):
             is_label = number < self.labels
-            table.add_column(escape(str(label)), justify="left" if is_label else "right", no_wrap=is_label)
+            table.add_column(Text(str(label)), justify="left" if is_label else "right", no_wrap=is_label)
         for row, cells in enumerate(self.frame.to_numpy()):
             texts = [Text(str(cell), "bold" if (row, column) in self.bold else "") for column, cell in enumerate(cells)]
             table.add_row(*texts, style="dim" if row in self.dim else None)

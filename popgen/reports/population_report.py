@@ -7,8 +7,8 @@ from typing import Any
 
 import pandas as pd
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from popgen.population.manifest import folder_name
 from popgen.population.store import Population
@@ -68,7 +68,7 @@ def render_population(population: Population) -> Group:
     }
     grid = Table.grid(padding=(0, 2))
     for name, value in facts.items():
-        grid.add_row(name, escape(value))
+        grid.add_row(name, Text(value))
     return Group(grid, "", _members_sheet(report).to_rich())
 
 

@@ -14,6 +14,8 @@ import fcntl
 import json
 import math
 import os
+import re
+import secrets
 import socket
 import time
 from collections import Counter
@@ -23,7 +25,8 @@ from typing import Any, TextIO
 
 from popgen.config.run_config import RunConfig
 from popgen.durable_files import read_regular, replace_file
-from popgen.errors import UserError
+from popgen.errors import UserError, mask_credentials
+from popgen.runs.interruption import describe_interruption
 
 LOCK, STATE = "run.lock", "state.json"
 STATES = ("running", "finished", "failed", "interrupted", "damaged")
@@ -34,6 +37,7 @@ _STATE_TYPES: dict[str, Any] = {
     **{"state": str, "attempt": int, "pid": int, "host": str},
     **{"began": int | float, "seconds": int | float, "error": str},
 }
+_COLOURS = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _TAKEN = (errno.EAGAIN, errno.EACCES)
 _TRIES, _PAUSE = 40, 0.05  # a look at the lock holds it for a moment, and a killed process until it is gone
 _ACTIVE = ("metrics.jsonl", "ledger.jsonl", STATE)
@@ -41,12 +45,19 @@ _ACTIVE = ("metrics.jsonl", "ledger.jsonl", STATE)
 
 
 def named(config: RunConfig) -> RunConfig:
-    """The config with an id for its run: method, environment, seed and time, if it has none."""
+    """The config with an id for its run, if it has none: method, environment, seed, time, and letters of its own,
+    because many runs can start in a second."""
     if config.run.id:
         return config
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
-    name = f"{config.method}-{Path(config.env.name).stem}-s{config.run.seed}-{stamp}"
+    name = f"{describe_settings(config)}-{stamp}-{secrets.token_hex(3)}"
     return config.model_copy(update={"run": config.run.model_copy(update={"id": name})})
+
+
+def describe_settings(config: RunConfig) -> str:
+    """Method, environment and seed as part of a folder's name; a layout's file may be called anything."""
+    layout = re.sub(r"[^A-Za-z0-9._-]+", "-", Path(config.env.name).stem)[:40]
+    return f"{config.method}-{layout}-s{config.run.seed}"
 
 
 def run_folder(config: RunConfig) -> Path:
@@ -98,8 +109,7 @@ class RunState:
 
     def end(self, status: str, error: BaseException | None = None) -> None:
         """It ended with an MLflow status; the lock is given up."""
-        text = None if error is None else " ".join((str(error) or type(error).__name__).split())[:500]
-        self._write_state(OUTCOMES[status], text)
+        self._write_state(OUTCOMES[status], None if error is None else describe_end(error))
         self.release()
 
     def release(self) -> None:
@@ -181,6 +191,18 @@ def describe_run(folder: Path) -> dict[str, Any]:
     told = state.get("error")
     known |= {"state": _present_state(folder, state, done), "error": None if told is None else _strip_controls(told)}
     return known | {"total_steps": sum(known["steps"].values())}
+
+
+def describe_end(error: BaseException) -> str:
+    """What ended a run, in one line of plain text: Ray's errors bring colours and the tracebacks of other processes."""
+    if (interruption := describe_interruption(error)) is not None:
+        return interruption
+    cause = getattr(error, "cause", None)
+    known = cause if isinstance(cause, BaseException) else error
+    text = _strip_controls(" ".join(_COLOURS.sub("", mask_credentials(str(known))).split()))
+    name = type(known).__name__
+    says_all = isinstance(known, UserError) or type(known) is RuntimeError
+    return (text if text and says_all else f"{name}: {text}" if text else name)[:500]
 
 
 def _strip_controls(value: Any) -> str:

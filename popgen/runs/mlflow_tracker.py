@@ -7,18 +7,16 @@ but to that store.
 
 from __future__ import annotations
 
-import http.client
 import logging
 import os
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from popgen.config.sections import TrackingConfig
-from popgen.errors import UserError
+from popgen.errors import UserError, mask_credentials
+from popgen.runs.tracking_address import sqlite_uri
 
 BATCH = 1000
 """Metrics in one `log_batch`: MLflow's own limit. One by one, ten thousand points take minutes on sqlite."""
@@ -27,7 +25,6 @@ KEPT = 100_000
 """Points kept while the store does not answer; older ones are dropped beyond it."""
 
 SCALING_METRIC = "environment_steps_by_members"
-_SCHEMES = ("sqlite", "http", "https", "postgresql", "mysql", "mssql")
 _QUIET = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "DO_NOT_TRACK": "true",
@@ -36,30 +33,6 @@ _QUIET = {
     "GIT_PYTHON_REFRESH": "quiet",
 }
 _log = logging.getLogger(__name__)
-
-
-def check_uri(uri: str | None, timeout: float = 5.0) -> None:
-    """Look at a tracking URI without MLflow.
-
-    Raises:
-        UserError: a scheme that MLflow has no database or server for, or a server that does not answer in `timeout` s.
-    """
-    if uri is None:
-        return
-    scheme, _, place = uri.partition("://")
-    scheme = scheme.partition("+")[0].lower()
-    if scheme not in _SCHEMES or not place.strip("/"):
-        raise UserError("tracking.uri", f"cannot track to {uri!r}", f"use null or one of {'://, '.join(_SCHEMES)}://")
-    if scheme not in ("http", "https"):
-        return
-    try:
-        urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=timeout).close()
-    except urllib.error.HTTPError:
-        return  # it answered; /health may be closed by a proxy
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise UserError(
-            "tracking.uri", f"no server answers at {uri} ({error})", "start it or use tracking=sqlite"
-        ) from None
 
 
 class Tracker:
@@ -88,7 +61,7 @@ class Tracker:
         resume: Mapping[str, Any] | None = None,
     ) -> None:
         self.config, self.run_dir, self.run_name = config, Path(run_dir).resolve(), run_name
-        self.uri = config.uri or f"sqlite:///{self.run_dir / 'mlflow.db'}"
+        self.uri = config.uri or sqlite_uri(self.run_dir / "mlflow.db")
         self._runs: dict[str, str] = dict((resume or {}).get("runs", {}))
         self._points: dict[int | None, list[Any]] = {}
         self._client: Any = None
@@ -163,6 +136,7 @@ class Tracker:
         os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
         from mlflow.exceptions import MlflowException
         from mlflow.tracking import MlflowClient
+        from sqlalchemy.exc import SQLAlchemyError
 
         for name in ("mlflow", "alembic"):
             logging.getLogger(name).setLevel(logging.WARNING)
@@ -173,7 +147,7 @@ class Tracker:
             self._experiment = self._find_experiment()
             known = "parent" in self._runs
             parent = self._find_run(None)
-        except (MlflowException, OSError, ImportError) as error:
+        except (MlflowException, SQLAlchemyError, OSError, ImportError) as error:
             first = str(error).strip().partition("\n")[0]
             raise UserError("tracking.uri", f"cannot open {self.uri} ({first})", "or use tracking=off") from None
         if known:
@@ -240,7 +214,8 @@ class Tracker:
             call()
         except (MlflowException, OSError, *errors) as error:
             _log.warning(
-                "tracking: %s did not take a write, training goes on (%s)", self.uri, str(error).partition("\n")[0]
+                "tracking: %s did not take a write, training goes on (%s)",
+                *(mask_credentials(text) for text in (self.uri, str(error).partition("\n")[0])),
             )
             return False
         return True

@@ -17,8 +17,9 @@ from popgen.errors import UserError
 from popgen.methods.method import Continuation, Method, Needs
 from popgen.methods.registry import METHODS
 from popgen.runs import sizes
-from popgen.runs.mlflow_tracker import check_uri
+from popgen.runs.ray_folder import check_ray_folder
 from popgen.runs.resources import demands, total
+from popgen.runs.tracking_address import check_uri
 
 RAYS_SHARE = 0.3
 """Of the memory, for the object store where no size is given."""
@@ -43,6 +44,8 @@ def preflight(config: RunConfig) -> None:
     spec = _build(config)
     check_run_id(config.run.id)
     check_cluster(config)
+    if config.cluster.address is None and config.run.transport == "ray":
+        check_ray_folder()
     method = METHODS[config.method]
     method.check(config, spec)
     if config.tracking.enabled:

@@ -20,7 +20,7 @@ from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.population import PopulationWriter, load_population
 from popgen.population.manifest import MemberInfo
-from popgen.runs.directory import RunState, named, run_folder
+from popgen.runs.directory import RunState, describe_end, named, run_folder
 from popgen.runs.ledger import Ledger
 from popgen.runs.monitoring import DiskWatch, RunLog
 from popgen.runs.sinks.gauge_sink import GaugeSink
@@ -228,7 +228,7 @@ class RunRecorder:
             self.state.release()
 
     def _log_end(self, status: str, error: BaseException | None) -> None:
-        text = None if error is None else " ".join(str(error).split())[:500]
+        text = None if error is None else describe_end(error)
         self.events.write("end", level="INFO" if error is None else "ERROR", status=status, error=text)
 
 

@@ -19,6 +19,7 @@ from popgen.errors import UserError
 from popgen.runs.directory import read_state
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGCONT)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 RAY_ENDED_US = 1
 """Exit code of a process that Ray's library ended; also that of a traceback, before which a run's state is written."""
 
@@ -49,7 +50,9 @@ def guarded(folder: Path, retries: int) -> int | None:
         return None
     spent, most = 0, -1
     while (pid := _fork_child()) != 0:
-        code = _wait_for_child(pid)
+        code, asked = _wait_for_child(pid)
+        if asked and code == RAY_ENDED_US:
+            return 128 + asked  # whoever ends us may have ended Ray's processes too, and its library then the child
         if not _without_a_word(folder, pid, code):
             return _same_end(code)
         done = _file_size(folder / "ledger.jsonl")
@@ -75,10 +78,15 @@ def _fork_child() -> int:
     return 0
 
 
-def _wait_for_child(pid: int) -> int:
-    """The child's exit code, or less the number of the signal that ended it; signals are forwarded meanwhile."""
+def _wait_for_child(pid: int) -> tuple[int, int]:
+    """The child's exit code, or less the number of the signal that ended it; and the signal by which we were asked to
+    end meanwhile, 0 without one. Signals are forwarded."""
+    asked = 0
 
     def forward(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        if number in ENDING:
+            asked = number
         with suppress(ProcessLookupError):
             os.kill(pid, number)
         if number == signal.SIGTSTP:
@@ -88,7 +96,7 @@ def _wait_for_child(pid: int) -> int:
     try:  # not blocked in waitpid: a signal that comes just before it would wait there with us
         while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
             time.sleep(LOOK)
-        return os.waitstatus_to_exitcode(ended[1])
+        return os.waitstatus_to_exitcode(ended[1]), asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

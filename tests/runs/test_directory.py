@@ -115,7 +115,10 @@ def test_looking_at_a_run_does_not_end_its_lock(folder: Path, elsewhere: Any) ->
         ("FAILED", UserError("training", "loss is\nnan", "lower it"), "failed", "training: loss is nan; lower it"),
         ("FAILED", RuntimeError(), "failed", "RuntimeError"),
         ("FAILED", RuntimeError("a\nb" + "x" * 1000), "failed", "a b" + "x" * 497),
-        ("KILLED", KeyboardInterrupt(), "interrupted", "KeyboardInterrupt"),
+        ("FAILED", RuntimeError("\x1b[36mray::Tracker\x1b[39m says"), "failed", "ray::Tracker says"),
+        ("FAILED", OSError("http://me:secret@host/x"), "failed", "OSError: http://***@host/x"),
+        ("KILLED", SystemExit(15), "interrupted", "interrupted by SIGTERM"),
+        ("KILLED", KeyboardInterrupt(), "interrupted", "interrupted by Ctrl-C"),
     ],
 )
 def test_how_it_ended(folder: Path, status: str, error: BaseException | None, state: str, told: str | None) -> None:
@@ -259,7 +262,7 @@ def test_the_command(folder: Path, capsys: pytest.CaptureFixture[str], monkeypat
     monkeypatch.chdir(folder.parent.parent)
     assert cli.main(["runs"]) == 0
     out, _ = capsys.readouterr()
-    for cell in ("first", "failed", "2 of 3", "random 30, SP 12", "is full [bold]"):
+    for cell in ("first", "failed", "2 of 3", "random 30", "SP 12", "is full [bold]"):
         assert cell in out
     assert cli.main(["runs", "nowhere"]) == 2
     assert capsys.readouterr().err.startswith("popgen: error: nowhere: is not a folder")

@@ -11,7 +11,7 @@ import pytest
 from popgen.config.sections import TrackingConfig
 from popgen.errors import UserError
 from popgen.methods.xpm_wm.config import XpmWmRun
-from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker, check_uri
+from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker
 
 
 def history(tracker: Tracker, run: str, metric: str) -> list[tuple[int, float]]:
@@ -163,17 +163,6 @@ def test_off_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     tracker.log_artifact(tmp_path)
     tracker.finish()
     assert not tracker.enabled and tracker.state() == {"runs": {}} and list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("uri", ["file:///tmp/x", "mlruns", "ftp://host", "http://127.0.0.1:9", "http://[bad"])
-def test_a_store_that_cannot_work_is_refused(uri: str) -> None:
-    with pytest.raises(UserError, match="tracking.uri"):
-        check_uri(uri, timeout=2.0)
-
-
-@pytest.mark.parametrize("uri", [None, "sqlite:////tmp/x.db", "postgresql+psycopg2://u@h/d"])
-def test_stores_that_need_no_server_pass(uri: str | None) -> None:
-    check_uri(uri)
 
 
 def test_a_store_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from numba import njit
 
+from popgen.envs.overcooked.compiled_kernel import compile_kernel
+
 # `_nrt=False` below: the kernels allocate nothing, and without it numba counts references to every array at every
 # call of a helper, which made encoding six times slower
 
@@ -132,7 +134,7 @@ def _advance_pots(states, s, pots, table, auto):
             states[slot + 1] = cooking - 1
 
 
-@njit(cache=True, _nrt=False)
+@compile_kernel
 def step(states, size, actions, table, values, meta, reward, score, events, truncated):
     """Step N kitchens in place.
 
@@ -217,7 +219,7 @@ def _world_features(states, s, table, meta, out, at, other):
         out[other + start] = 1
 
 
-@njit(cache=True, _nrt=False)
+@compile_kernel
 def encode_features(states, size, table, meta, out):
     """`features` of both players, all of `out` written.
 
@@ -296,7 +298,7 @@ def _lossless_world(states, s, table, meta, walls, out, at, other):
             _lossless_item(out, at + here, other + here, states[slot + i], table)
 
 
-@njit(cache=True, _nrt=False)
+@compile_kernel
 def encode_lossless(states, size, table, meta, walls, out):
     """overcooked_ai's lossless encoding for both players, all of `out` written.
 
@@ -347,7 +349,7 @@ def _decode_world(features, start, meta, codes, row):
     row[TIME + 1] = time >> 8
 
 
-@njit(cache=True, _nrt=False)
+@compile_kernel
 def decode_features(features, meta, codes, out):
     """One player's `features` (N, F) -> states (N, S) uint8 in which that player is the first.
 

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from popgen.envs.overcooked import kernels as k
+from popgen.envs.overcooked.compiled_kernel import compile_kernel
 from popgen.envs.overcooked.env import OvercookedEnv
 
 EVENTS = (
@@ -203,7 +204,7 @@ def _moves(row, actions, table, out):
                 out[p, IDLE_MOVE] = 1
 
 
-@njit(cache=True, _nrt=False)
+@compile_kernel
 def find_events(states, actions, table, pots, auto, row, out):
     """Events of N transitions.
 

@@ -34,6 +34,7 @@ GREY = "#444444"
 """Of legend entries that stand for every colour."""
 
 _STYLE: Any = {
+    "text.parse_math": False,  # a "$" in a name is a letter
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.labelsize": 8,
