@@ -6,7 +6,11 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-_LAZY = {"load_population": "popgen.population", "make_env": "popgen.envs"}
+_LAZY = {
+    "load_population": "popgen.population",
+    "make_env": "popgen.envs",
+    "recipe": "popgen.methods.registry",
+}
 __all__ = ["__version__", *_LAZY]
 
 

@@ -118,3 +118,13 @@ def pair(text: str) -> tuple[str, Any]:
         return key, yaml.safe_load(value)
     except yaml.YAMLError:
         raise argparse.ArgumentTypeError(f"cannot read the value of {text!r}") from None
+
+
+def add_config_dir(parser: argparse.ArgumentParser) -> None:
+    """`--config-dir`, of every command that composes a configuration."""
+    parser.add_argument(
+        "--config-dir",
+        default=None,
+        metavar="DIR",
+        help="your own presets, such as DIR/scale/NAME.yaml or DIR/env/NAME.yaml",
+    )

@@ -6,7 +6,7 @@ import argparse
 from contextlib import closing
 from typing import Any
 
-from popgen.cli.arguments import add_command, at_least, finite, named_path, words
+from popgen.cli.arguments import add_command, add_config_dir, at_least, finite, named_path, words
 from popgen.cli.printing import OK, print_json, print_report
 from popgen.cli.training import runs_to_start
 
@@ -32,7 +32,9 @@ def add(commands: Any) -> None:
         metavar="'KEY=VALUE ...'",
         help="run this first (as `popgen run`), in DIR/runs, unless it is finished there; label=NAME calls it NAME",
     )
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="for every --start")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="for every --start whose method has it"
+    )
     parser.add_argument("--agents", type=at_least(1), default=8, help="extrapolate costs to this many (%(default)s)")
     for name, which in (("--sp", "SP of at least"), ("--xp", "XP of at most")):
         told = f"equal quality: {which} this (0.8 and 0.2 of the SP of the paper's XPM-WM on the layout)"
@@ -40,13 +42,14 @@ def add(commands: Any) -> None:
     parser.add_argument("--out", default="comparison", metavar="DIR", help="of the report (%(default)s)")
     parser.add_argument("--tracking-uri", default=None, metavar="URI", help="of MLflow (sqlite in DIR)")
     parser.add_argument("--no-tracking", action="store_true", help="no MLflow")
+    add_config_dir(parser)
 
 
 def compare(args: argparse.Namespace) -> int:
     """Start what is asked for, and compare all runs."""
     labels = [next((w.partition("=")[2] for w in words if w.startswith("label=")), None) for words in args.start]
     overrides = [[*(word for word in words if not word.startswith("label=")), *args.set] for words in args.start]
-    configs = runs_to_start(overrides, args.out)
+    configs = runs_to_start(overrides, args.out, args.set, args.config_dir, quiet=args.quiet)
     from popgen.config.sections import TrackingConfig
     from popgen.pipelines.compare import EXPERIMENT, compare_runs
     from popgen.progress import make_reporter

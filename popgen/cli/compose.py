@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from popgen.cli.printing import short
 from popgen.errors import UserError
 from popgen.methods.recipe import SourcedSetting
+
+if TYPE_CHECKING:
+    from popgen.config.run_config import RunConfig
 
 ALIASES = {"seed": "run.seed"}
 OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take any key
@@ -23,18 +26,30 @@ CHOICES = ("method", "scale", "env")
 
 
 @dataclass(frozen=True)
+class PresetValue:
+    """What a preset file gives a field, and the option that names the file."""
+
+    value: Any
+    option: str
+
+
+@dataclass(frozen=True)
 class Composed:
     """A configuration and where it comes from.
 
     Attributes:
         values: the plain dictionary, not yet checked by the schemas.
         recipe: what the recipe sets, by dotted field.
+        presets: dotted fields that a preset file sets -> the file's value and its name, such as env=overcooked/mine.
         overridden: dotted fields that the command line sets.
+        schema: of the method.
     """
 
     values: dict[str, Any]
     recipe: dict[str, SourcedSetting]
+    presets: dict[str, PresetValue]
     overridden: tuple[str, ...]
+    schema: type[RunConfig]
 
 
 def compose(overrides: Sequence[str], config_dir: str | None = None) -> dict[str, Any]:
@@ -62,7 +77,50 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     base = _merge(schema.model_validate({}).as_dict(), recipe.values(chosen["env"]["name"]))
     values = _compose(base, translated, overrides, folder, lambda key: unknown_field(key, schema))
     keys = [override.lstrip("+").partition("=")[0] for override in translated]
-    return Composed(values, recipe.list_settings(chosen["env"]["name"]), tuple(keys))
+    layout = chosen["env"]["name"]
+    return Composed(values, recipe.list_settings(layout), _list_presets(translated, folder), tuple(keys), schema)
+
+
+def choose_method(overrides: Sequence[str], config_dir: str | None = None) -> str:
+    """The method that overrides, or a preset that they name, choose.
+
+    Raises:
+        UserError: an override that cannot be read, an unknown option.
+    """
+    folder = None if config_dir is None else _preset_folder(config_dir)
+    return str(_choose([_translate(override) for override in overrides], overrides, folder)["method"])
+
+
+def _list_presets(translated: Sequence[str], folder: Path | None) -> dict[str, PresetValue]:
+    """What the chosen files of conf/ and of a user's folder set, the last one winning as in Hydra's defaults list."""
+    from omegaconf import OmegaConf
+
+    from popgen.conf import DIRECTORY
+
+    chosen = {}
+    for entry in OmegaConf.load(DIRECTORY / "config.yaml").defaults:
+        chosen |= dict(entry) if OmegaConf.is_dict(entry) else {}
+    given = (word.partition("=") for word in translated)
+    chosen |= {key.lstrip("+"): option for key, _, option in given if group_options(key.lstrip("+"), folder)}
+    found: dict[str, PresetValue] = {}
+    for group, option in chosen.items():
+        found |= {"env.name": PresetValue(option, f"env={option}")} if group == "env" else {}
+        paths = [root / group / f"{option}.yaml" for root in (DIRECTORY, *([folder] if folder else []))]
+        for path in (path for path in paths if path.is_file()):
+            values = OmegaConf.to_container(OmegaConf.load(path), resolve=False) or {}
+            is_global = "@package _global_" in path.read_text(encoding="utf-8").partition("\n")[0]
+            prefix = "" if is_global else f"{group.replace('/', '.')}."
+            found |= {key: PresetValue(value, f"{group}={option}") for key, value in _flatten(values, prefix)}
+    return found
+
+
+def _flatten(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values of nested dictionaries."""
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _preset_folder(path: str) -> Path:
@@ -127,18 +185,24 @@ def _store_groups(base: dict[str, Any], folder: Path | None) -> None:
     store.store(name="schema", node=base)
     for group, options in _installed_options().items():
         for option in options - _file_options(group, folder):
-            store.store(group=group, name=option, node={group: option}, package="_global_")
+            inner, _, name = f"{group}/{option}".rpartition("/")
+            if group == "env":
+                store.store(group=inner, name=name, node={"name": option, "params": {}}, package="env")
+            else:
+                store.store(group=inner, name=name, node={group: option}, package="_global_")
 
 
 def _installed_options() -> dict[str, set[str]]:
-    """Methods and their recipes; those of a package that cannot be imported are left out until they are asked for."""
+    """Methods, their recipes, and environments; those of a package that cannot be imported are left out until they are
+    asked for."""
+    from popgen.envs.env_registry import env_names
     from popgen.methods.registry import METHODS
 
     scales: set[str] = set()
     for name in METHODS:
         with suppress(UserError):
             scales |= METHODS[name].recipes.keys()
-    return {"method": set(METHODS), "scale": scales}
+    return {"method": set(METHODS), "scale": scales, "env": set(env_names())}
 
 
 def group_options(group: str, config_dir: Path | None = None) -> list[str]:

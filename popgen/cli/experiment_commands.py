@@ -6,7 +6,7 @@ import argparse
 from contextlib import closing
 from typing import Any
 
-from popgen.cli.arguments import Parser, add_command, at_least, label_and_path, numbers
+from popgen.cli.arguments import Parser, add_command, add_config_dir, at_least, label_and_path, numbers
 from popgen.cli.printing import OK, print_json, print_report
 from popgen.cli.training import runs_to_start
 from popgen.errors import UserError
@@ -41,8 +41,8 @@ def _add_self_sabotage(kinds: Any) -> None:
         metavar="METHOD=PATH",
         help="a finished population or run",
     )
-    methods = ("lipo", "comedi", "xpm_sim", "mappo")
-    parser.add_argument("--method", action="append", choices=methods, help="what to train (the paper's three)")
+    parser.add_argument("--method", action="append", metavar="METHOD", help="what to train (the paper's three)")
+    add_config_dir(parser)
     parser.add_argument(
         "--termination",
         choices=("penalty", "plain", "both"),
@@ -69,11 +69,15 @@ def _add_shared_encoder(kinds: Any) -> None:
     parser.add_argument("--run", action="append", default=[], metavar="DIR", help="a finished run of either kind")
     parser.add_argument("--seeds", type=numbers, default=[1], metavar="1,2,...", help="of training (1)")
     parser.add_argument("--out", default="shared-encoder", metavar="DIR", help="of the report (%(default)s)")
+    add_config_dir(parser)
 
 
 def self_sabotage(args: argparse.Namespace) -> int:
     """Train what is not given, and tell who leaves the task in cross-play."""
-    methods = args.method or ([] if args.population else ["lipo", "comedi", "xpm_sim"])
+    from popgen.methods.registry import find_method
+    from popgen.reports.sabotage_report import list_paper_methods
+
+    methods = [find_method(name).name for name in args.method or ([] if args.population else list_paper_methods())]
     if args.overrides and not methods:
         raise UserError("overrides", "have no use where nothing is trained", "name what to train with --method")
     from popgen.reports.sabotage_report import NOTES, TERMINATIONS, summary, to_sheets
@@ -87,7 +91,7 @@ def self_sabotage(args: argparse.Namespace) -> int:
         for method in methods
         for seed in args.seeds
     ]
-    configs = runs_to_start(overrides, args.out)
+    configs = runs_to_start(overrides, args.out, args.overrides, args.config_dir, quiet=args.quiet)
     from popgen.pipelines import experiments
     from popgen.progress import make_reporter
 
@@ -110,7 +114,7 @@ def shared_encoder(args: argparse.Namespace) -> int:
     base = [*_rendezvous(args.overrides), "method=xpm_sim", "population.size=8", *args.overrides]
     kinds = [] if args.run else ["none", "shared"]
     overrides = [[*base, f"xpm_sim.encoder={kind}", f"seed={seed}"] for seed in args.seeds for kind in kinds]
-    configs = runs_to_start(overrides, args.out)
+    configs = runs_to_start(overrides, args.out, args.overrides, args.config_dir, quiet=args.quiet)
     from popgen.pipelines.shared_encoder_experiment import shared_encoder as ablation
     from popgen.progress import make_reporter
     from popgen.reports.shared_encoder_report import summary

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
-from popgen.cli.arguments import add_command
+from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, to_yaml
 from popgen.cli.printing import OK, print_json, print_table
-from popgen.cli.training import before_ray
+from popgen.cli.training import before_ray, tell_notes
 
 
 def add(commands: Any) -> None:
@@ -22,15 +22,17 @@ def add(commands: Any) -> None:
         "generate a population",
         "Overrides are Hydra's: a group as in env=overcooked/cramped_room, method=xpm_wm, scale=laptop, "
         "cluster=gpu_node or tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for "
-        "run.seed=1. The same run.id goes on where an interrupted run was. Exit codes: 0, 2 for an error told in one "
-        "line, 130 when interrupted. Keys of --json: run_id, run_dir, population (paths), members (how many), matrix "
-        "(mean and standard_error, row = seat 0, column = seat 1), ledger (environment steps by member and kind), "
-        "evaluation (as `evaluate --json`), files (the report's), seconds; with --dry-run the whole configuration.",
+        "run.seed=1. `popgen config METHOD` lists the fields. The same run.id goes on where an interrupted run was. "
+        "Exit codes: 0, 2 for an error told in one line, 130 when interrupted. Keys of --json: run_id, run_dir, "
+        "population (paths), members (how many), matrix (mean and standard_error, row = seat 0, column = seat 1), "
+        "ledger (environment steps by member and kind), evaluation (as `evaluate --json`), files (the report's), "
+        "seconds; with --dry-run the whole configuration.",
     )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
     parser.add_argument(
         "--dry-run", action="store_true", help="check everything, print the configuration, start nothing"
     )
+    add_config_dir(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,13 +44,15 @@ def run(args: argparse.Namespace) -> int:
     from popgen.runs.preflight import preflight
     from popgen.runs.supervisor import guarded
 
-    config = RunConfig.parse(compose(args.overrides))
+    config = RunConfig.parse(compose(args.overrides, args.config_dir))
     if args.own_process and not args.dry_run:
         config = named(config)
         if (code := guarded(run_folder(config), config.cluster.retries)) is not None:
             return code
         end_on_sigterm()
-    preflight(config)
+    spec = preflight(config)
+    if not args.quiet:
+        tell_notes(spec.notes)
     if args.dry_run:
         return _print_config(config.as_dict(), args.json)
     before_ray(config.cluster.threads, config.cluster.address is None)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import secrets
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from popgen.cli.compose import compose
+from popgen.cli.compose import choose_method, compose
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
@@ -33,10 +33,30 @@ def before_ray(threads: int, local: bool) -> None:
     bound_threads(threads)
 
 
-def runs_to_start(overrides: Sequence[Sequence[str]], out: str) -> list[RunConfig]:
+def tell_notes(notes: Iterable[str]) -> None:
+    """Lines for the user on stderr, which stay beside results on stdout."""
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def runs_to_start(
+    overrides: Sequence[Sequence[str]],
+    out: str,
+    shared: Sequence[str] = (),
+    config_dir: str | None = None,
+    *,
+    quiet: bool = False,
+) -> list[RunConfig]:
     """The runs that a command starts itself, in folders under `out` that their settings decide.
 
     All that can be known before the first of them starts is checked, and the place of the report.
+
+    Args:
+        overrides: of each run.
+        out: folder.
+        shared: those of them that all runs were given; one that only some methods have is left out for the others.
+        config_dir: the user's own presets.
+        quiet: say nothing of what is left out, and of what to know about the environments.
 
     Raises:
         UserError: what cannot work.
@@ -44,7 +64,9 @@ def runs_to_start(overrides: Sequence[Sequence[str]], out: str) -> list[RunConfi
     from popgen.config.run_config import RunConfig
     from popgen.runs.preflight import check_root, preflight
 
-    configs = [RunConfig.parse(compose(words)) for words in overrides]
+    notes: dict[str, None] = {}
+    kept = leave_out_foreign(overrides, shared, config_dir, notes)
+    configs = [RunConfig.parse(compose(words, config_dir)) for words in kept]
     local = all(config.cluster.address is None for config in configs)
     before_ray(max((config.cluster.threads for config in configs), default=1), local)
     from popgen.pipelines.run_batch import check_different, named
@@ -52,6 +74,30 @@ def runs_to_start(overrides: Sequence[Sequence[str]], out: str) -> list[RunConfi
     configs = [named(config, Path(out) / "runs") for config in configs]
     check_different(configs)
     for config in configs:
-        preflight(config)
+        notes |= dict.fromkeys(f"{config.env.name}: {note}" for note in preflight(config).notes)
     check_root(Path(out), 16 * 2**20, "--out")
+    if not quiet:
+        tell_notes(notes)
     return configs
+
+
+def leave_out_foreign(
+    overrides: Sequence[Sequence[str]], shared: Sequence[str], config_dir: str | None, notes: dict[str, None]
+) -> list[list[str]]:
+    """The overrides without those shared ones that a run's method lacks and another run's has; `notes` takes these.
+
+    A setting that none of the methods has stays, for its run to be refused by.
+    """
+    from popgen.config.run_config import field_names
+    from popgen.methods.registry import METHODS
+
+    methods = [choose_method(words, config_dir) for words in overrides] if shared else []
+    fields = {method: set(field_names(METHODS[method].config)) for method in methods}
+    kept = [list(words) for words in overrides]
+    for words, method in zip(kept, methods, strict=False):
+        foreign = set().union(*fields.values()) - fields[method]
+        for word in shared:
+            if word.lstrip("+~").partition("=")[0] in foreign:
+                words.remove(word)
+                notes[f"{word} is left out for {method}, which has no such setting"] = None
+    return kept

@@ -115,9 +115,9 @@ def closest_field(key: str, schema: type[RunConfig]) -> str | None:
 def unknown_field(key: str, schema: type[RunConfig]) -> UserError:
     """The error for a key that the schema of the run's method does not have."""
     meant = closest_field(key, schema)
-    fix = f"did you mean {meant}?" if meant else "see `popgen run --dry-run`"
-    owners = import_module(_REGISTRY).methods_with(key)
     method = schema.model_fields["method"].default
+    fix = f"did you mean {meant}?" if meant else f"see `popgen config {method}`"
+    owners = import_module(_REGISTRY).methods_with(key)
     if owners and method not in owners:
         return UserError(key, f"is a setting of {' and '.join(owners)}, which {method} does not have", fix)
     return UserError(key, "there is no such field", fix)

@@ -1,65 +1,124 @@
-"""Registry of environment families: the part of the name before the slash picks the family."""
+"""Families of environments by name: the built-in ones, and those that installed distributions offer.
+
+The part of an environment's name before the slash is its family's. A distribution offers a family as
+`popgen.environments` by an entry point of that name in its pyproject.toml (docs/adding.md):
+
+    [project.entry-points."popgen.environments"]
+    my_family = "my_package.family:FAMILY"
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from popgen.envs.contract import BatchedEnv
 from popgen.errors import UserError
 
-
-def _overcooked(variant: str, num_envs: int, seed: int, params: dict[str, Any]) -> BatchedEnv:
-    from popgen.envs.overcooked import OvercookedEnv
-
-    return OvercookedEnv(variant, num_envs, seed=seed, **params)
+GROUP = "popgen.environments"
 
 
-def _rendezvous(variant: str, num_envs: int, seed: int, params: dict[str, Any]) -> BatchedEnv:
-    from popgen.envs.rendezvous import RendezvousEnv
+@dataclass(frozen=True)
+class EnvFamily:
+    """Environments of one kind.
 
-    if variant != "mppmr":  # before the parameters, which may be another environment's
-        raise UserError("env.name", f"unknown environment 'rendezvous/{variant}'", "choose rendezvous/mppmr")
-    return RendezvousEnv(variant, num_envs, seed=seed, **params)
+    Attributes:
+        name: before the slash.
+        variants: names after the slash that need no parameters: listed, tested, and options of `env=`.
+        environment: `module:class` of a `BatchedEnv`, called as (variant, num_envs, seed=seed, **parameters) and
+            imported when one is made.
+        is_open: the class takes other variants too, such as a path, and judges them itself.
+    """
+
+    name: str
+    variants: tuple[str, ...]
+    environment: str
+    is_open: bool = False
+
+    def load_environment(self) -> Callable[..., BatchedEnv]:
+        """The class."""
+        module, _, name = self.environment.partition(":")
+        return getattr(import_module(module), name)
+
+    def list_names(self) -> list[str]:
+        """Whole names of the variants."""
+        return [f"{self.name}/{variant}" for variant in self.variants]
 
 
-FAMILIES: dict[str, Callable[[str, int, int, dict[str, Any]], BatchedEnv]] = {
-    "overcooked": _overcooked,
-    "rendezvous": _rendezvous,
+BUILT_IN = {
+    "overcooked": EnvFamily(
+        "overcooked",
+        (
+            "cramped_room",
+            "asymmetric_advantages",
+            "coordination_ring",
+            "forced_coordination",
+            "counter_circuit_o_1order",
+        ),
+        "popgen.envs.overcooked:OvercookedEnv",
+        is_open=True,
+    ),
+    "rendezvous": EnvFamily("rendezvous", ("mppmr",), "popgen.envs.rendezvous:RendezvousEnv"),
 }
-
 
 _GIVEN = {"self", "layout", "variant", "num_envs", "seed"}
 """Arguments of the environments that `make_env` gives."""
 
 
+@cache
+def _offered() -> dict[str, EntryPoint]:
+    """Families of other distributions; a built-in name cannot be taken."""
+    return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN}
+
+
+@cache
+def _load_family(name: str) -> EnvFamily:
+    if name in BUILT_IN:
+        return BUILT_IN[name]
+    entry = _offered()[name]
+    try:
+        family = entry.load()
+    except Exception as error:  # whatever a package of others raises when it is imported
+        problem = f"{name} ({entry.value}) cannot be imported: {error}"
+        raise UserError("env.name", problem, "repair its package") from None
+    if not isinstance(family, EnvFamily) or family.name != name:
+        problem = f"{entry.value} is no popgen.envs.EnvFamily with the name {name!r}"
+        raise UserError("env.name", problem, "repair its package")
+    return family
+
+
 def env_names() -> list[str]:
-    """Names that need no further parameters: the tested entries of the registry."""
-    layouts = (
-        "cramped_room",
-        "asymmetric_advantages",
-        "coordination_ring",
-        "forced_coordination",
-        "counter_circuit_o_1order",
-    )
-    return [f"overcooked/{layout}" for layout in layouts] + ["rendezvous/mppmr"]
+    """Names that need no further parameters; a family whose package cannot be imported is left out."""
+    names: list[str] = []
+    for family in (*BUILT_IN, *_offered()):
+        with suppress(UserError):
+            names += _load_family(family).list_names()
+    return names
 
 
 def make_env(name: str, num_envs: int = 1, /, *, seed: int = 0, **params: Any) -> BatchedEnv:
     """Build B environments of a registered family.
 
     Raises:
-        UserError: unknown family, layout or parameter, or a batch size below 1.
+        UserError: unknown family, variant or parameter, a batch size below 1, or a package that cannot be imported.
     """
-    family, _, variant = str(name).partition("/")
-    if family not in FAMILIES:
+    kind, _, variant = str(name).partition("/")
+    if kind not in BUILT_IN and kind not in _offered():
         raise UserError("env.name", f"unknown environment {name!r}", f"choose one of {', '.join(env_names())}")
+    family = _load_family(kind)
+    if variant not in family.variants and not family.is_open:  # before the parameters, which may be another one's
+        raise UserError("env.name", f"unknown environment {name!r}", f"choose {' or '.join(family.list_names())}")
     if num_envs < 1:
         raise UserError("num_envs", f"must be at least 1, got {num_envs}")
     if reserved := sorted(_GIVEN & params.keys()):
         raise UserError(f"env.params.{reserved[0]}", "is no parameter of an environment", "leave it out")
     try:
-        return FAMILIES[family](variant, num_envs, seed, params)
+        return family.load_environment()(variant, num_envs, seed=seed, **params)
     except TypeError as error:
         if "unexpected keyword" not in str(error):
             raise

@@ -66,6 +66,11 @@ def termination_of(params: Mapping[str, Any]) -> str:
     return next((name for name, rule in TERMINATIONS.items() if params.get("exit_penalty") == rule["exit_penalty"]), "")
 
 
+def list_paper_methods() -> list[str]:
+    """Names of the methods in the paper's table."""
+    return [name_of(row.method) for row in SABOTAGE]
+
+
 def build_report(environment: str, episodes: int, seed: int, steps: int, rows: Sequence[Mapping[str, Any]]) -> dict:
     """The JSON object of the module's docstring, from its rows."""
     return {

@@ -33,8 +33,8 @@ MOST_EPISODES = 1_000_000
 _RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
-def preflight(config: RunConfig) -> None:
-    """Refuse a run that cannot go well.
+def preflight(config: RunConfig) -> EnvSpec:
+    """Refuse a run that cannot go well; what is known of its environment.
 
     Raises:
         UserError: an environment that cannot be built or pays nothing for events, a view it does not have, windows or
@@ -60,6 +60,7 @@ def preflight(config: RunConfig) -> None:
     check_root(Path(config.run.root), sizes.disk_bytes(config, needs))
     if config.run.storage is not None:
         check_storage(config, needs)
+    return spec
 
 
 def check_evaluation(config: RunConfig) -> None:

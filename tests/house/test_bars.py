@@ -8,9 +8,7 @@ import pytest
 
 from house.figures import BARS, ROOT, Bar, find_import_cycles, find_late_attributes, judge, measure_short_helpers
 
-OPEN = {
-    "methods' names as literals outside popgen/methods and conf",
-}
+OPEN: set[str] = set()
 """Bars that are not reached yet; a name leaves this list for good."""
 
 

@@ -1,0 +1,90 @@
+"""`popgen config`: what is shown, and where it says that values come from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from popgen.cli.compose import compose
+from popgen.config.run_config import RunConfig
+from popgen.methods.registry import METHODS
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def fields(run: Run, *words: str) -> dict[str, dict[str, Any]]:
+    code, out, err = run("config", *words, "--json")
+    assert code == 0, err
+    return {row["name"]: row for row in json.loads(out)["fields"]}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_it_shows_what_the_same_words_would_run(run: Run, method: str) -> None:
+    words = ["scale=demo", "env=overcooked/coordination_ring", "seed=3"]
+    shown = fields(run, method, *words)
+    values = RunConfig.parse(compose([f"method={method}", *words])).as_dict()
+    for name, row in shown.items():
+        value: Any = values
+        for part in name.split("."):
+            value = value[part]
+        assert row["value"] == value, name
+
+
+def test_a_value_comes_from_the_last_that_sets_it(run: Run) -> None:
+    shown = fields(run, "env=overcooked/forced_coordination", "phase1.model_updates=30", "agent.lam=0.95")
+    assert {
+        name: shown[name]["source"]
+        for name in ("agent.units", "phase1.max_steps", "agent.entropy", "phase1.model_updates", "agent.lam")
+    } == {
+        "agent.units": "schema",
+        "phase1.max_steps": "recipe laptop",
+        "agent.entropy": "layout row of laptop",
+        "phase1.model_updates": "command line",
+        "agent.lam": "command line",
+    }
+    assert (shown["agent.entropy"]["value"], shown["agent.entropy"]["default"]) == (0.04, 0.02)
+    assert "first soup" in shown["agent.entropy"]["reason"] and not shown["agent.entropy"]["ours"]
+    assert shown["env.name"]["source"] == "preset env=overcooked/forced_coordination"
+    assert fields(run, "scale=paper")["phase1.patience"]["ours"]
+
+
+def test_a_preset_of_ones_own_is_named(run: Run, tmp_path: Path) -> None:
+    preset = tmp_path / "mine" / "scale" / "tiny.yaml"
+    preset.parent.mkdir(parents=True)
+    preset.write_text("# @package _global_\nscale: tiny\nagent:\n  units: 24\n")
+    given = ("scale=tiny", "--config-dir", str(tmp_path / "mine"))
+    shown = fields(run, *given)
+    assert (shown["agent.units"]["value"], shown["agent.units"]["source"]) == (24, "preset scale=tiny")
+    assert shown["agent.layers"]["source"] == "schema"
+    code, out, _ = run("run", "--dry-run", "--json", *given)
+    assert code == 0 and json.loads(out)["agent"]["units"] == 24
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_table_fits_eighty_columns_and_tells_everything(
+    run: Run, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = run("config", method, "scale=paper")
+    assert code == 0 and max(map(len, out.splitlines())) <= 80
+    squeezed = "".join(out.split())
+    for row in fields(run, method, "scale=paper").values():
+        cells = [row["name"].rpartition(".")[2], row["source"]]
+        assert all("".join(cell.split()) in squeezed for cell in cells), row["name"]
+
+
+def test_a_section_alone(run: Run) -> None:
+    assert {name.partition(".")[0] for name in fields(run, "lipo", "--section", "diversity")} == {"diversity"}
+    assert set(fields(run, "--section", "general")) == {"method", "scale"}
+    code, out, err = run("config", "mappo", "--section", "agent")
+    assert code == 2 and out == "" and "choose one of general, env" in err and err.count("\n") == 1
+
+
+def test_mistakes_are_those_of_run(run: Run) -> None:
+    for words in (["lipo2"], ["agent.lamda_xp=1"], ["agent.lambda_xp=-1"], ["a", "b"]):
+        code, out, err = run("config", *words)
+        assert code == 2 and out == "" and err.startswith("popgen: error: ") and err.count("\n") == 1, err
