@@ -27,6 +27,9 @@ BUILT_IN: dict[str, str] = {
     "lipo": "popgen.methods.mappo.method:LIPO",
     "comedi": "popgen.methods.mappo.method:COMEDI",
     "mappo": "popgen.methods.mappo.method:MAPPO",
+    "fcp": "popgen.methods.mappo.method:FCP",
+    "mep": "popgen.methods.mappo.method:MEP",
+    "trajedi": "popgen.methods.mappo.method:TRAJEDI",
 }
 """name -> `module:record`, imported when first needed."""
 

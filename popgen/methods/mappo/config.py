@@ -144,6 +144,46 @@ class MappoRun(BaselineRun):
     """Self-play alone."""
 
 
+class FcpRun(BaselineRun):
+    """A run of FCP: three members a seed."""
+
+    method: Literal["fcp"] = "fcp"
+
+
+class MepConfig(Schema):
+    """The population entropy of MEP (Zhao et al. 2023)."""
+
+    alpha: Weight = 0.01
+    """Reward for each nat of surprise and seat, where the training reward of a dish is 18 or more (the paper's alpha);
+    0 is MAPPO."""
+    floor: Rate = 1e-5
+    """Least probability that counts: it bounds what one step can earn."""
+
+
+class MepRun(BaselineRun):
+    """A run of MEP."""
+
+    method: Literal["mep"] = "mep"
+    mep: MepConfig = MepConfig()
+
+
+class TrajediConfig(Schema):
+    """The trajectory divergence of TrajeDi (Lupu et al. 2021)."""
+
+    alpha: Weight = 0.1
+    """Reward for each nat of divergence, at every step (the paper's alpha); 0 is MAPPO."""
+    kernel: Fraction = 0.5
+    """Weight of a step's neighbour beside the step's own (the paper's gamma): 0 compares single actions, 1 all that an
+    iteration has of an episode (`ppo.steps` at most)."""
+
+
+class TrajediRun(BaselineRun):
+    """A run of TrajeDi."""
+
+    method: Literal["trajedi"] = "trajedi"
+    trajedi: TrajediConfig = TrajediConfig()
+
+
 class PartnerRun(BaselineRun):
     """What the runs of baselines that meet partners have."""
 

@@ -1,12 +1,14 @@
 """The baselines on RLlib's MAPPO as the rest of the house knows them."""
 
-from popgen.methods.mappo.config import ComediRun, LipoRun, MappoRun
+from popgen.methods.mappo.config import ComediRun, FcpRun, LipoRun, MappoRun, MepRun, TrajediRun
+from popgen.methods.mappo.fcp import check_fcp
 from popgen.methods.mappo.needs import (
     check_comedi,
     check_view,
     estimate_comedi,
     estimate_lipo,
     estimate_mappo,
+    estimate_together,
     list_actors,
 )
 from popgen.methods.mappo.recipes import COMEDI_RECIPES, LIPO_RECIPES, RECIPES
@@ -52,4 +54,46 @@ COMEDI = Method(
     actors=list_actors,
     needs=estimate_comedi,
     check=check_comedi,
+)
+
+FCP = Method(
+    name="fcp",
+    title="FCP",
+    summary="Self-play by different seeds, each kept before, half-way through and after its training.",
+    colour="#009E73",
+    marker="D",
+    config=FcpRun,
+    recipes=RECIPES,
+    training="popgen.methods.mappo.fcp:open_training",
+    actors=list_actors,
+    needs=estimate_mappo,
+    check=check_fcp,
+)
+
+MEP = Method(
+    name="mep",
+    title="MEP",
+    summary="All members together, paid for what the population seldom does, on RLlib's MAPPO.",
+    colour="#56B4E9",
+    marker="P",
+    config=MepRun,
+    recipes=RECIPES,
+    training="popgen.methods.mappo.mep:open_training",
+    actors=list_actors,
+    needs=estimate_together,
+    check=check_view,
+)
+
+TRAJEDI = Method(
+    name="trajedi",
+    title="TrajeDi",
+    summary="All members together, paid for trajectories that diverge from the others', on RLlib's MAPPO.",
+    colour="#000000",
+    marker="X",
+    config=TrajediRun,
+    recipes=RECIPES,
+    training="popgen.methods.mappo.trajedi:open_training",
+    actors=list_actors,
+    needs=estimate_together,
+    check=check_view,
 )

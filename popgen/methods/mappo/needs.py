@@ -23,6 +23,12 @@ def estimate_mappo(config: BaselineRun, spec: EnvSpec) -> Needs:
     return _estimate(config, spec, critics=1, environments=config.ppo.envs)
 
 
+def estimate_together(config: BaselineRun, spec: EnvSpec) -> Needs:
+    """Bytes of self-play of all members at once."""
+    size = config.population.size
+    return _estimate(config, spec, critics=1, environments=size * config.ppo.envs, together=size)
+
+
 def estimate_lipo(config: LipoRun, spec: EnvSpec) -> Needs:
     """Bytes with cross-play: all pairs together, or those of the last member."""
     size, together = config.population.size, config.diversity.order == "concurrent"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from popgen.losses.diversity import SIGN
 from popgen.methods.mappo.config import DiversityConfig
+from popgen.methods.mappo.population_bonus import PopulationBonus
 from popgen.types import Kind
 
 
@@ -36,10 +37,14 @@ class Objective:
         terms: beside self-play.
         fresh_episodes: the strongest partner is found by whole episodes of the present policy with every partner,
             played for that alone; otherwise by the episodes of training, which then has cross-play with every partner.
+        together: all members learn together, though they never meet.
+        bonus: a reward beside the environment's, by what the other members that learn would do.
     """
 
     terms: tuple[Term, ...] = ()
     fresh_episodes: bool = False
+    together: bool = False
+    bonus: PopulationBonus | None = None
 
     @property
     def meets_partners(self) -> bool:

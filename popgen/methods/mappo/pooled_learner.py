@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,9 +18,11 @@ from torch import Tensor
 from popgen.losses.ppo import clipped_surrogate, negated_surrogate
 from popgen.losses.schedules import annealed
 from popgen.methods.mappo.pooling import Plan, PooledBatch, pool
+from popgen.methods.mappo.population_bonus import joint_log_probs
 from popgen.methods.mappo.rl_module import CRITICS, MemberModule, module_id
 from popgen.methods.mappo.slots import Rollout
 from popgen.nets.weights import Weights, load_optimiser_state, load_weights, optimiser_state, weights_of
+from popgen.play.trajectories import Trajectories
 
 NETWORKS = ("actor", CRITICS)
 """Parts of a module, each with an optimiser and a gradient norm of its own."""
@@ -81,6 +83,7 @@ class PooledLearner(PPOTorchLearner):
                 discount=ppo.discount,
                 lam=ppo.lam,
                 value_decay=ppo.value_decay,
+                bonus=self._bonus_of(member),
             )
             if batch is not None:
                 batches[member] = batch.to(self._device)
@@ -140,6 +143,14 @@ class PooledLearner(PPOTorchLearner):
         rate = annealed(ppo.learning_rate, ppo.learning_rate_end, progress)
         for optimiser in self._named_optimizers.values():
             self._set_optimizer_lr(optimiser, rate)
+
+    def _bonus_of(self, member: int) -> Callable[[Trajectories], Tensor] | None:
+        """What a member's self-play is paid by the job's bonus, with all members' present actors."""
+        job = self.config.job
+        if job.bonus is None:
+            return None
+        actors = {other: self._module_of(other).actor for other in job.learning}
+        return lambda steps: job.bonus(joint_log_probs(steps, member, actors))
 
     def _module_of(self, member: int) -> MemberModule:
         return self.module[module_id(member)].unwrapped()

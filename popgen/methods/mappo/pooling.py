@@ -10,7 +10,7 @@ would drown a beginner's self-play, whose returns are small beside what a traine
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -196,16 +196,23 @@ def pool(
     discount: float,
     lam: float,
     value_decay: float,
+    bonus: Callable[[Trajectories], Tensor] | None = None,
 ) -> PooledBatch | None:
     """One member's batch; None where it played no self-play (a runner was lost).
 
-    Each critic takes its returns into its statistics.
+    Each critic takes its returns into its statistics. `bonus` gives a reward (T, N) on top of self-play's.
     """
     own, parts, rows, figures = None, [], {}, {}
     for kind, partner, weight in plan.sources(member):
         played, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
         if played is None or not bool(played.trained.any()):
             continue
+        label = str(kind).lower()
+        figures[f"{label}_reward"] = float(played.steps.reward[played.trained.any(-1)].mean())
+        if kind is Kind.SP and bonus is not None:
+            paid = bonus(played.steps)
+            figures["bonus"] = float(paid.mean())
+            played = replace(played, steps=replace(played.steps, reward=played.steps.reward + paid))
         critic = critics[name]
         assert isinstance(critic, ValueNet)
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
@@ -224,9 +231,7 @@ def pool(
         parts.append(_policy_rows(played, centred, kind))
         critic.see(returns[counted].to(critic.mean.device), value_decay)
         rows[name] = _critic_rows(played, critic, returns, counted, view)
-        label = str(kind).lower()
         figures |= {
-            f"{label}_reward": float(played.steps.reward[counted].mean()),
             f"{label}_advantage_std": float(chosen.std(correction=0)),
             f"{label}_explained": _explained_share(chosen, returns[counted]),
         }

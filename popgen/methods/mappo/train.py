@@ -12,7 +12,7 @@ gives no more than this loop over its iterations.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 
 import torch
@@ -63,7 +63,7 @@ def partner_settings(objective: Objective, config: BaselineRun) -> DiversityConf
 def learning_members(objective: Objective, config: BaselineRun, first: int) -> tuple[int, ...]:
     """The members that learn together with `first`."""
     diversity = partner_settings(objective, config)
-    together = diversity is not None and diversity.order == "concurrent"
+    together = objective.together or diversity is not None and diversity.order == "concurrent"
     return tuple(range(1, config.population.size + 1)) if together else (first,)
 
 
@@ -81,6 +81,7 @@ def training_job(
         frozen={member: archive[member] for member in range(1, first)} if diversity else {},
         mixed=diversity is not None and objective.samples(Kind.MP, diversity),
         fresh=objective.fresh_episodes,
+        bonus=objective.bonus,
     )
 
 
@@ -131,13 +132,12 @@ class RllibTraining:
             yield Progress(first, steps, note=f"continuing after {algorithm.rounds} iterations of {names}")
         while not algorithm.finished:
             algorithm.train()
-            yield from self._report_iteration()
+            yield from self.report_iteration()
             yield self._end_round()
-        for member in self.learning:
-            yield self._finish_member(member)
+        yield from self.finish_members()
         self.close()
 
-    def _report_iteration(self) -> Loop:
+    def report_iteration(self) -> Loop:
         """An iteration's step counts, then each member's figures."""
         report, ppo, now = self.algorithm.report, self.config.ppo, self.progress
         counts: list[StepCount] = []
@@ -173,7 +173,12 @@ class RllibTraining:
             must_save=algorithm.finished,
         )
 
-    def _finish_member(self, member: int) -> TrainedMember:
+    def finish_members(self) -> Iterator[TrainedMember]:
+        """All that this training gives."""
+        for member in self.learning:
+            yield self.finish_member(member)
+
+    def finish_member(self, member: int) -> TrainedMember:
         """The actor as it is saved, its critics beside it."""
         algorithm, seconds = self.algorithm, self._count_seconds()
         policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), algorithm.actors()[member], self.spec)
@@ -250,9 +255,18 @@ def open_rllib(
     Raises:
         UserError: everything is to be in this process, which RLlib cannot do without Ray.
     """
+    refuse_inline(transport)
+    return RllibTraining(config, spec, attempt, objective)
+
+
+def refuse_inline(transport: Transport) -> None:
+    """RLlib starts its own workers.
+
+    Raises:
+        UserError: everything is to be in this process.
+    """
     if isinstance(transport, InlineTransport):
         raise UserError("run.transport", "is inline, but RLlib needs Ray", "set run.transport=ray")
-    return RllibTraining(config, spec, attempt, objective)
 
 
 def open_training(config: BaselineRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:

@@ -8,6 +8,7 @@ from typing import Any
 
 from popgen.config.sections import EnvConfig
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
+from popgen.methods.mappo.population_bonus import PopulationBonus
 from popgen.nets.feed_forward import Sizes
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match
@@ -26,6 +27,7 @@ class Job:
         mixed: with mixed play (CoMeDi).
         fresh: the strongest partner is matches by episodes of its own (CoMeDi), not by the training's.
         seed: of everything.
+        bonus: added to self-play's reward.
     """
 
     env: EnvConfig
@@ -36,6 +38,7 @@ class Job:
     frozen: Mapping[int, Weights] = field(default_factory=dict)
     mixed: bool = False
     fresh: bool = False
+    bonus: PopulationBonus | None = None
 
     def partners(self, member: int) -> list[int]:
         """Whom a learning member meets in cross-play."""

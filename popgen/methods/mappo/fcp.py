@@ -1,0 +1,100 @@
+"""FCP (Strouse et al. 2021), fictitious co-play: self-play by different seeds, at different skill.
+
+    J(j) = J_SP(j)
+
+Each seed gives three members: the policy it started from, one on its way whose self-play is nearest to half of the
+final one's, and the final one. All of a seed's environment steps are counted for its final member.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from popgen.envs.contract import EnvSpec
+from popgen.errors import UserError
+from popgen.methods.mappo.config import FcpRun
+from popgen.methods.mappo.needs import check_view
+from popgen.methods.mappo.objective import SELF_PLAY
+from popgen.methods.mappo.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
+from popgen.methods.mappo.train import RllibTraining, refuse_inline
+from popgen.methods.mappo.training_job import policy_config
+from popgen.methods.training import Checkpoint, Loop, State, TrainedMember
+from popgen.methods.transport import Transport
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+
+SKILLS = ("initial", "half", "final")
+"""Of a seed's members, in order."""
+
+
+class FcpTraining(RllibTraining):
+    """One seed after the other; see `popgen.methods.training.Training`."""
+
+    def __init__(self, config: FcpRun, spec: EnvSpec, attempt: str) -> None:
+        super().__init__(config, spec, attempt, SELF_PLAY)
+        self.skills = SkillCheckpoints()
+
+    def first_of_group(self, member: int) -> int:
+        """The initial member of the seed that `member` is of."""
+        return member - (member - 1) % len(SKILLS)
+
+    def begin(self, first: int) -> tuple[int, ...]:
+        """RLlib trains the final member; the others are kept on the way."""
+        final = first + len(SKILLS) - 1
+        super().begin(final)
+        self.skills = SkillCheckpoints()
+        self._keep_policy(0.0)
+        return tuple(range(first, final + 1))
+
+    def report_iteration(self) -> Loop:
+        """The present policy is a candidate for the one at half skill."""
+        yield from super().report_iteration()
+        scores = self.algorithm.scores(self.learning[0])
+        if "sp" in scores:
+            self._keep_policy(scores["sp"])
+
+    def _keep_policy(self, score: float) -> None:
+        final = self.learning[0]
+        self.skills.add(SkillCheckpoint(self.progress.steps[final], score, self.algorithm.actors()[final]))
+
+    def finish_members(self) -> Iterator[TrainedMember]:
+        """The three of this seed."""
+        final = self.finish_member(self.learning[0])
+        reached = float(final.extra.get("sp", 0.0))
+        chosen = (self.skills.kept[0], self.skills.nearest(reached / 2.0))
+        for number, (skill, checkpoint) in enumerate(zip(SKILLS, chosen, strict=False)):
+            member = final.member - len(SKILLS) + 1 + number
+            extra = {"skill": skill, "of_member": final.member, "at_steps": checkpoint.steps, "sp": checkpoint.score}
+            policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), checkpoint.actor, self.spec)
+            self.archive[member] = policy.weights()
+            note = f"member {member}: {skill} of member {final.member}, {checkpoint.steps:,} steps into its training"
+            yield TrainedMember(member, policy, None, seed=final.seed, extra=extra, left=final.left, note=note)
+        final.extra["skill"] = SKILLS[-1]
+        yield final
+
+    def checkpoint(self) -> State:
+        """See `Training`."""
+        return {**super().checkpoint(), "skills": self.skills.state()}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """See `Training`."""
+        super().restore(checkpoint)
+        self.skills = SkillCheckpoints.from_state(checkpoint.state["skills"])
+
+
+def check_fcp(config: FcpRun, spec: EnvSpec) -> None:
+    """The view, and whole seeds.
+
+    Raises:
+        UserError: a view that the environment does not have, or members that are no whole seeds.
+    """
+    check_view(config, spec)
+    size, each = config.population.size, len(SKILLS)
+    if size % each:
+        problem = f"{size} is no multiple of {each}: each seed gives an initial, a half trained and a final member"
+        raise UserError("population.size", problem, f"set it to {size + each - size % each}")
+
+
+def open_training(config: FcpRun, spec: EnvSpec, attempt: str, transport: Transport) -> FcpTraining:
+    """See `popgen.methods.transport.OpenTraining`."""
+    refuse_inline(transport)
+    return FcpTraining(config, spec, attempt)
