@@ -27,6 +27,7 @@ BUILT_IN: dict[str, str] = {
     "lipo": "popgen.methods.mappo.method:LIPO",
     "comedi": "popgen.methods.mappo.method:COMEDI",
     "mappo": "popgen.methods.mappo.method:MAPPO",
+    # The population; an ego agent that is trained with one has another name here, ego_fcp.
     "fcp": "popgen.methods.mappo.method:FCP",
     "mep": "popgen.methods.mappo.method:MEP",
     "trajedi": "popgen.methods.mappo.method:TRAJEDI",
