@@ -238,6 +238,37 @@ def test_sequential_lipo_meets_its_predecessors_only(root: Path) -> None:
     assert "critics.XP_1.mean" in (run.population.training(2) or {})
 
 
+def test_fcp_keeps_a_seed_at_three_skills(root: Path) -> None:
+    """Killed at the second iteration and gone on with: the same members, none of whose steps is counted twice."""
+    overrides = ("method=fcp", "population.size=3")
+    whole = launch(root, "fcp", *overrides)
+    with pytest.raises(Killed):
+        launch(root, "fcp_again", *overrides, die_at="train:2")
+    again = launch(root, "fcp_again", *overrides)
+    assert again.sha256s() == whole.sha256s() and len(set(whole.sha256s())) == 3
+    assert whole.said == whole.counted() == again.counted() == {(3, "SP"): SP_STEPS}
+    extra = [whole.population.info(member).extra for member in (1, 2, 3)]
+    assert [one["skill"] for one in extra] == ["initial", "half", "final"]
+    assert extra[0]["at_steps"] == 0 and 0 < extra[1]["at_steps"] <= SP_STEPS and extra[1]["of_member"] == 3
+
+
+def test_members_that_are_paid_for_diversity_learn_together(root: Path) -> None:
+    """TrajeDi's weight of 0 gives the weights of MEP's weight of 0, and another one others."""
+    runs = {
+        name: launch(root, name, f"method={name.partition('_')[0]}", "population.size=2", *overrides)
+        for name, overrides in {
+            "mep_0": ("mep.alpha=0",),
+            "trajedi_0": ("trajedi.alpha=0",),
+            "trajedi_1": ("trajedi.alpha=1",),
+        }.items()
+    }
+    assert runs["mep_0"].sha256s() == runs["trajedi_0"].sha256s() != runs["trajedi_1"].sha256s()
+    for run in runs.values():
+        assert run.counted() == run.said == {(1, "SP"): SP_STEPS, (2, "SP"): SP_STEPS}
+    rows = [json.loads(line) for line in (runs["trajedi_1"].dir / "metrics.jsonl").open()]
+    assert all(np.isfinite(row["ppo/bonus"]) and row["ppo/bonus"] != 0.0 for row in rows)
+
+
 METHODS = {
     "concurrent": ("method=lipo",),
     "sequential": ("method=lipo", "diversity.order=sequential"),

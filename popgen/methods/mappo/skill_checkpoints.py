@@ -43,8 +43,8 @@ class SkillCheckpoints:
         self.kept = [one for one in self.kept if one is not redundant]
 
     def nearest(self, score: float) -> SkillCheckpoint:
-        """The one whose score is nearest; the earlier of two."""
-        return min(self.kept, key=lambda one: (abs(one.score - score), one.steps))
+        """The one after the first whose score is nearest, the earlier of two; the first where there is no other."""
+        return min(self.kept[1:] or self.kept, key=lambda one: (abs(one.score - score), one.steps))
 
     def state(self) -> State:
         """For a checkpoint of the run."""

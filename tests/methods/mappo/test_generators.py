@@ -82,8 +82,8 @@ def test_skill_checkpoints_keep_the_first_and_spread_over_scores() -> None:
     assert again == kept
 
 
-def test_of_two_equally_near_the_earlier_is_the_half_trained() -> None:
-    kept = SkillCheckpoints([SkillCheckpoint(9, 6.0, {}), SkillCheckpoint(5, 4.0, {})])
+def test_of_two_equally_near_the_earlier_is_the_half_trained_and_the_first_is_none() -> None:
+    kept = SkillCheckpoints([SkillCheckpoint(0, 5.0, {}), SkillCheckpoint(9, 6.0, {}), SkillCheckpoint(5, 4.0, {})])
     assert kept.nearest(5.0).steps == 5
 
 
