@@ -207,16 +207,13 @@ def pool(
         played, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
         if played is None or not bool(played.trained.any()):
             continue
-        label = str(kind).lower()
-        figures[f"{label}_reward"] = float(played.steps.reward[played.trained.any(-1)].mean())
+        counted, label = played.trained.any(-1), str(kind).lower()
+        figures[f"{label}_reward"] = float(played.steps.reward[counted].mean())
         if kind is Kind.SP and bonus is not None:
-            paid = bonus(played.steps)
-            figures["bonus"] = float(paid.mean())
-            played = replace(played, steps=replace(played.steps, reward=played.steps.reward + paid))
+            played = _add_bonus(played, bonus(played.steps), figures)
         critic = critics[name]
         assert isinstance(critic, ValueNet)
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
-        counted = played.trained.any(-1)
         chosen = advantage[counted]
         if kind is Kind.XP and own is not None:
             chosen = bound_advantage(chosen, clip=plan.xp_clip, spread=own)
@@ -239,6 +236,12 @@ def pool(
         return None
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     return PooledBatch(**joined, critics=rows, figures=figures)
+
+
+def _add_bonus(played: MemberTrajectories, bonus: Tensor, figures: dict[str, float]) -> MemberTrajectories:
+    """The same trajectories with a richer reward."""
+    figures["bonus"] = float(bonus.mean())
+    return replace(played, steps=replace(played.steps, reward=played.steps.reward + bonus))
 
 
 def _policy_rows(played: MemberTrajectories, advantage: Tensor, kind: Kind) -> dict[str, Tensor]:
