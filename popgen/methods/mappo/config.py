@@ -148,6 +148,7 @@ class FcpRun(BaselineRun):
     """A run of FCP: three members a seed."""
 
     method: Literal["fcp"] = "fcp"
+    """Self-play by several seeds, each kept at three skills."""
 
 
 class MepConfig(Schema):
@@ -164,7 +165,9 @@ class MepRun(BaselineRun):
     """A run of MEP."""
 
     method: Literal["mep"] = "mep"
+    """Self-play of all members together, paid for the population's entropy."""
     mep: MepConfig = MepConfig()
+    """The population's entropy."""
 
 
 class TrajediConfig(Schema):
@@ -181,7 +184,9 @@ class TrajediRun(BaselineRun):
     """A run of TrajeDi."""
 
     method: Literal["trajedi"] = "trajedi"
+    """Self-play of all members together, paid for diverging trajectories."""
     trajedi: TrajediConfig = TrajediConfig()
+    """The divergence of trajectories."""
 
 
 class PartnerRun(BaselineRun):
