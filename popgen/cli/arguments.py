@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import re
 import shlex
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -95,7 +97,7 @@ def named_path(text: str) -> tuple[str | None, str]:
     """NAME=PATH, or a path alone; a name holds no slash."""
     name, equals, _ = text.partition("=")
     if not equals or "/" in name:
-        return None, text
+        return None, expand_home(text)
     return label_and_path(text)
 
 
@@ -104,7 +106,23 @@ def label_and_path(text: str) -> tuple[str, str]:
     name, _, path = text.partition("=")
     if not name or not path or "/" in name or len(name) > 40:
         raise argparse.ArgumentTypeError(f"must be NAME=PATH with a short name without slashes, got {text!r}")
-    return name, path
+    return name, expand_home(path)
+
+
+def expand_home(text: str) -> str:
+    """A path, or an address that holds one, with `~` replaced as a shell would do where a path begins with it.
+
+    Raises:
+        UserError: there is no such home.
+    """
+
+    def expand(found: re.Match[str]) -> str:
+        home = os.path.expanduser(found[2])
+        if home.startswith("~"):
+            raise UserError("arguments", f"{found[2]!r} in {text!r} names no home folder", "write the path out")
+        return found[1] + home
+
+    return re.sub(r"(^|/)(~[\w.-]*)(?=/|$)", expand, text)
 
 
 def pair(text: str) -> tuple[str, Any]:

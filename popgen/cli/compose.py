@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from popgen.cli.arguments import expand_home
 from popgen.cli.printing import short
 from popgen.errors import UserError
 from popgen.methods.recipe import SourcedSetting
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 ALIASES = {"seed": "run.seed"}
 OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take any key
 
+
+QUOTES = "'\""
 
 CHOICES = ("method", "scale", "env")
 """Groups that decide which schema and which recipe the other settings stand on."""
@@ -243,9 +247,16 @@ def _translate(override: str) -> str:
             raise UserError(key, "Hydra's own settings have no use here", "leave it out")
         if key in ALIASES:
             return f"{ALIASES[key]}={value}"
+        if re.search(r"(^|[/'\"])~", value):  # a sign of Hydra's, but never meant so in a value
+            override = f"{key}={_quote(expand_home(value.strip(QUOTES)))}"
         is_open = key in OPEN_SECTIONS or key.startswith(tuple(f"{name}." for name in OPEN_SECTIONS))
         return f"++{override}" if is_open else override
     raise UserError("overrides", f"cannot read {short(override)!r}", "write KEY=VALUE")
+
+
+def _quote(text: str) -> str:
+    """A value that Hydra takes as it is."""
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _unset(values: Any, prefix: str = "") -> list[str]:
@@ -270,6 +281,9 @@ def _composition_error(
         return UserError(
             "overrides", f"cannot read {_culprit(text, overrides)!r}", "write KEY=VALUE, with quotes around odd text"
         )
+    if (sweep := re.search(r"([\w.]+)=\w+\(.*--multirun|Sweep parameters '([\w.]+)", text)) is not None:
+        fix = "give one; several runs need several commands"
+        return UserError(sweep[1] or sweep[2], "asks for several values", fix)
     if text.startswith("Ambiguous value"):
         fix = "write a list as KEY=[a,b]; several runs need several commands"
         return UserError(

@@ -15,7 +15,7 @@ from popgen.cli import humans_commands as humans
 from popgen.cli import play_command as play
 from popgen.cli import population_commands as population
 from popgen.cli import run_command as run
-from popgen.cli.arguments import Parser
+from popgen.cli.arguments import Parser, expand_home
 from popgen.cli.printing import ERROR
 from popgen.errors import UserError
 
@@ -28,7 +28,7 @@ def parse(argv: list[str]) -> argparse.Namespace:
         SystemExit: there was nothing but a help text or the version to print.
     """
     parser = _parser()
-    args, rest = parser.parse_known_args(argv)
+    args, rest = parser.parse_known_args([_expand_word(word) for word in argv])
     if hasattr(args, "overrides"):  # overrides may stand after options too
         args.overrides = [*args.overrides, *(word for word in rest if not word.startswith("-"))]
         rest = [word for word in rest if word.startswith("-")]
@@ -38,6 +38,14 @@ def parse(argv: list[str]) -> argparse.Namespace:
         parser.print_help(sys.stderr)
         raise SystemExit(ERROR)
     return args
+
+
+def _expand_word(word: str) -> str:
+    """`~/path` and `--option=~/path`; settings (`KEY=VALUE`) have rules of their own."""
+    option, equals, value = word.partition("=")
+    if option.startswith("--") and equals:
+        return f"{option}={expand_home(value)}"
+    return expand_home(word) if "=" not in word else word
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import Any
@@ -21,6 +22,9 @@ from popgen.config.sections import (
     TrackingConfig,
 )
 from popgen.errors import UserError, mask_credentials
+
+LAYOUT_FILE = ".layout"
+"""End of an environment's name that is a file's path."""
 
 _REGISTRY = "popgen.methods.registry"
 """Module that knows each method's schema; imported by its name, since methods stand above this package."""
@@ -64,8 +68,16 @@ class RunConfig(Schema):
         return _mask_values(self.model_dump(mode="json"))
 
     def digest(self) -> str:
-        """sha256 of everything that decides the result (not of where it runs or is tracked)."""
+        """sha256 of everything that decides the result (not of where it runs or is tracked).
+
+        Nor of where files lie: a layout's file is known by the rules in it, which the population's manifest holds, and
+        the run that this one begins from by its id.
+        """
         kept = {k: v for k, v in self.as_dict().items() if k not in ("cluster", "tracking", "run")}
+        if (name := self.env.name).endswith(LAYOUT_FILE):
+            kept["env"]["name"] = f"{name.partition('/')[0]}/*{LAYOUT_FILE}"
+        if self.population.init_from is not None:
+            kept["population"]["init_from"] = os.path.basename(os.path.abspath(self.population.init_from))
         kept["seed"], kept["schedule"] = self.run.seed, self.run.schedule
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictBool, model_validator
+from pydantic import AfterValidator, Field, StrictBool, model_validator
 
 from popgen.config.schema import Batch, Positive, Schema, Text, Weight, _Int
 from popgen.errors import UserError
+
+Place = Annotated[str, AfterValidator(os.path.expanduser)]
+"""A path, whose `~` is the home folder."""
 
 
 class EnvConfig(Schema):
@@ -30,7 +34,7 @@ class PopulationConfig(Schema):
 
     size: Annotated[_Int, Field(ge=1, le=1000)] = 3
     """Members of the population (the paper's M)."""
-    init_from: str | None = None
+    init_from: Place | None = None
     """Folder of a run whose first members this population takes over and goes on from; null trains all."""
     init_members: Positive = 1
     """How many members to take over from `init_from`."""
@@ -94,7 +98,7 @@ class RunSection(Schema):
 
     id: Text | None = None
     """Name of the run and of its folder; the same name goes on where an interrupted run was; null makes one."""
-    root: str = "runs"
+    root: Place = "runs"
     """Folder that holds the runs' folders."""
     seed: Annotated[_Int, Field(ge=0, lt=2**31)] = 0
     """Seed of all randomness of the run."""

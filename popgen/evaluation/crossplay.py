@@ -50,9 +50,8 @@ class Estimate:
         return {name: float(value) if math.isfinite(value) else None for name, value in values.items()}
 
     def below(self, other: Estimate) -> bool:
-        """Lower than `other` by more than two standard errors of the difference (0 where they are unknown)."""
-        error = math.hypot(self.error, other.error)
-        return self.mean < other.mean - (2 * error if math.isfinite(error) else 0.0)
+        """Lower than `other` by more than two standard errors of the difference; never where one is unknown."""
+        return self.mean < other.mean - 2 * math.hypot(self.error, other.error)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Needs overcooked_ai; nothing else in popgen imports this module.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from overcooked_ai_py.mdp.actions import Action
 
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.envs.overcooked.bridge import from_overcooked_ai, infer_joint_action
+from popgen.envs.overcooked.kernels import NUM_ACTIONS, STAY
 from popgen.errors import UserError
 from popgen.play.policy import Policy
 
@@ -22,7 +24,7 @@ class OvercookedAgent(Agent):
 
     overcooked_ai shows an agent only states, so the partner's last action is inferred from its effect; where several
     actions have the same effect, such as steps against a wall, `stay` stands for them. The own actions are those
-    that were answered.
+    that were answered, unless the new state tells otherwise.
 
     Args:
         policy: for this agent alone: it keeps the memory of one episode.
@@ -76,18 +78,33 @@ class OvercookedAgent(Agent):
     def action(self, state: Any) -> tuple[Any, dict[str, Any]]:
         """Answer an `OvercookedState` with one of overcooked_ai's actions and its one-hot probabilities.
 
+        A state that is shown again gets the same answer.
+
         Raises:
-            ValueError: the state does not follow from the last one: `reset` was not called for a new episode.
+            ValueError: the state is of an earlier time than the last one: `reset` was not called for a new episode.
         """
         row = from_overcooked_ai(self._env, state)
-        joint = np.zeros((1, 2), np.uint8)
-        if self._previous is not None:
-            before, own = self._previous
-            joint[0, self._seat] = own
-            joint[0, 1 - self._seat] = infer_joint_action(self._env, before, row, self._seat, own)
-        obs = self._env.encode(row[None], self._policy.view)
-        first = np.array([self._previous is None])
-        chosen = int(self._policy.act(obs, joint, first)[0, self._seat])
-        self._previous = row, chosen
+        if self._previous is None or not np.array_equal(row, self._previous[0]):
+            joint = np.zeros((1, 2), np.uint8) if self._previous is None else self._guess_joint_action(row)[None]
+            obs = self._env.encode(row[None], self._policy.view)
+            first = np.array([self._previous is None])
+            self._previous = row, int(self._policy.act(obs, joint, first)[0, self._seat])
+        chosen = self._previous[1]
         action = Action.INDEX_TO_ACTION[chosen]
         return action, {"action_probs": self.a_probs_from_action(action)}
+
+    def _guess_joint_action(self, row: np.ndarray) -> np.ndarray:
+        """What was played since the last state, (2,) uint8: with the own answer if that explains the new state, else
+        with another own action, else `stay` beside the own answer."""
+        assert self._previous is not None
+        before, own = self._previous
+        if self._env.time(row) < self._env.time(before):
+            raise ValueError("this state is earlier than the last one: call reset at the beginning of a game")
+        joint = np.full(2, STAY, np.uint8)
+        for played in (own, *(action for action in range(NUM_ACTIONS) if action != own)):
+            with suppress(ValueError):
+                joint[1 - self._seat] = infer_joint_action(self._env, before, row, self._seat, played)
+                joint[self._seat] = played
+                return joint
+        joint[self._seat] = own
+        return joint

@@ -136,8 +136,11 @@ class PopulationWriter:
     def _check_same_run(self, wanted: Manifest) -> None:
         for name in ("environment", "method", "config_digest", "seed"):
             have, want = getattr(self.manifest, name), getattr(wanted, name)
-            if have != want:
-                shown = "" if name == "environment" else f" ({have!r} there, {want!r} here)"
+            if name == "environment":  # its name may be that of a file, which is elsewhere now
+                same, shown = have.fingerprint == want.fingerprint, ""
+            else:
+                same, shown = have == want, f" ({have!r} there, {want!r} here)"
+            if not same:
                 raise UserError(
                     str(self.path / MANIFEST), f"is of a run with another {name}{shown}", "choose another folder"
                 )
@@ -222,7 +225,7 @@ def load_population(path: str | Path) -> Population:
     Raises:
         UserError: not a population, written by another format version, or any file missing, damaged or ill-fitting.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if not (path / MANIFEST).exists() and (path / "population" / MANIFEST).exists():
         path = path / "population"
     if not (path / MANIFEST).exists():
@@ -286,6 +289,20 @@ def check_compatible(population: Population, spec: EnvSpec) -> None:
         problem = f"is {cooking_of(spec)}, the population was trained with {info.cooking}"
         raise UserError("env.params.cooking", problem, fix)
     if spec.fingerprint != info.fingerprint:
+        if different := _name_differences(spec, info):
+            raise UserError(*different[0], fix)
         here = f"{spec.name} ({spec.fingerprint[:12]})"
         there = f"{info.name} ({info.fingerprint[:12]})"
         raise UserError("env.name", f"is {here}, the population was trained in {there}", fix)
+
+
+def _name_differences(spec: EnvSpec, info: EnvironmentInfo) -> list[tuple[str, str]]:
+    """Field and problem of the parameters that tell two environments of one name apart."""
+    ours, theirs = jsonable(spec.params), info.params
+    if spec.name != info.name:
+        return []
+    return [
+        (f"env.params.{name}", f"is {ours.get(name)!r}, the population was trained with {theirs.get(name)!r}")
+        for name in sorted(ours.keys() | theirs.keys())
+        if ours.get(name) != theirs.get(name)
+    ]

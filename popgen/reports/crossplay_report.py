@@ -133,6 +133,8 @@ def summary(report: Mapping[str, Any]) -> list[str]:
         row = beside[partner]
         parts = ", ".join(f"partner in seat {seat} {estimate_text(row[f'seat_{seat}'])}" for seat in (0, 1))
         lines.append(f"beside {partner} {estimate_text(row['both'])} {unit} ({parts})")
+    if report["episodes"] == 1:
+        lines.append("obstruction: not judged, since one episode has no standard error; ask for more episodes")
     blocked = [partner for partner in PARTNERS if low[partner]]
     if blocked:
         lines.append(f"obstruction: XP is below play beside {' and '.join(blocked)} partners")

@@ -64,6 +64,7 @@ class RunRecorder:
         metrics = MetricsSink(self.dir, self.began)
         self.ledger = Ledger(self.dir / "ledger.jsonl")
         self.population = _open_population(self.dir, config, spec)
+        replace_file(self.dir / "config.json", json.dumps(config.as_dict(), indent=1).encode())
         self.tracker = tracker or NoTracker()
         self.mlflow = MlflowSink(self.dir, self.tracker, self.attempt)
         self.events = RunLog(self.dir, self.run_id, self.attempt)
@@ -233,7 +234,7 @@ class RunRecorder:
 
 
 def _check_same_config(folder: Path, config: RunConfig) -> None:
-    """Keep the config beside the run; a run that exists has the same.
+    """A run that exists has the same config.
 
     Raises:
         UserError: it has another, or one that cannot be read.
@@ -246,7 +247,6 @@ def _check_same_config(folder: Path, config: RunConfig) -> None:
             raise UserError("run.id", f"cannot go on with {path} ({error})", "choose another id") from None
         if previous.digest() != config.digest():
             raise UserError("run.id", f"{folder.name} exists with another config", "choose another id")
-    replace_file(path, json.dumps(config.as_dict(), indent=1).encode())
 
 
 def _count_attempt(folder: Path) -> int:

@@ -42,7 +42,8 @@ def test_below_needs_two_standard_errors_of_the_difference() -> None:
     # sqrt(0.3^2 + 0.4^2) = 0.5, so the difference must exceed 1
     assert Estimate(0.0, 0.3).below(Estimate(1.01, 0.4))
     assert not Estimate(0.0, 0.3).below(Estimate(0.99, 0.4))
-    assert Estimate(0.0, math.nan).below(Estimate(0.1, 0.4))
+    assert not Estimate(0.0, math.nan).below(Estimate(9.0, 0.4))  # one episode: nothing to judge by
+    assert not Estimate(0.0, 0.1).below(Estimate(9.0, math.nan))
     assert not Estimate(math.nan, 0.1).below(Estimate(1.0, 0.1))
     assert not Estimate(0.0, 0.1).below(Estimate(math.nan, math.nan))
 

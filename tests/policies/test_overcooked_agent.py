@@ -154,17 +154,58 @@ def test_another_game_is_refused(env: BatchedEnv, mdp: OvercookedGridworld) -> N
         OvercookedAgent(IdlePolicy(env.spec.action_names), env, 2)
 
 
-def test_a_jump_without_reset_is_told(env: BatchedEnv, mdp: OvercookedGridworld) -> None:
-    agent = OvercookedAgent(IdlePolicy(env.spec.action_names), env, 0)
-    state = mdp.get_standard_start_state()
-    agent.action(state)
-    for _ in range(2):
-        state, _ = mdp.get_state_transition(state, ((0, 1), (-1, 0)))
-    with pytest.raises(ValueError, match="explains"):
-        agent.action(state)
+def test_a_state_is_answered_once_however_often_it_is_shown(env: BatchedEnv, mdp: OvercookedGridworld) -> None:
+    policy = Recorder(env, 4)
+    agent, state = OvercookedAgent(policy, env, 0), mdp.get_standard_start_state()
     agent.reset()
-    action, info = agent.action(state)
+    for asked in (1, 2, 3):
+        answers = {agent.action(state)[0] for _ in range(3)}
+        assert len(answers) == 1 and len(policy.told) == asked
+        state, _ = mdp.get_state_transition(state, (answers.pop(), Action.STAY))
+
+
+@pytest.mark.parametrize("played", ["another action", "four ticks"])
+def test_a_game_that_goes_otherwise_goes_on(env: BatchedEnv, mdp: OvercookedGridworld, played: str) -> None:
+    """The own action that was really played is found from its effect; of states left out nothing is made up."""
+    policy = Recorder(env, 4)
+    agent, state = OvercookedAgent(policy, env, 0), mdp.get_standard_start_state()
+    agent.reset()
+    answer, _ = agent.action(state)
+    west, east = (-1, 0), (1, 0)
+    other = west if answer != west else east
+    for joint in [(other, Action.STAY)] if played == "another action" else [(west, east), (east, west)] * 2:
+        state, _ = mdp.get_state_transition(state, joint)
+    agent.action(state)
+    told, first = policy.told[-1]
+    assert not first
+    if played == "another action":
+        assert told.tolist() == [Action.ACTION_TO_INDEX[other], Action.ACTION_TO_INDEX[Action.STAY]]
+
+
+def test_an_earlier_state_without_reset_is_told(env: BatchedEnv, mdp: OvercookedGridworld) -> None:
+    agent = OvercookedAgent(IdlePolicy(env.spec.action_names), env, 0)
+    start = mdp.get_standard_start_state()
+    agent.action(mdp.get_state_transition(start, ((0, 1), (-1, 0)))[0])
+    with pytest.raises(ValueError, match="call reset"):
+        agent.action(start)
+    agent.reset()
+    action, info = agent.action(start)
     assert action == Action.STAY and info["action_probs"].tolist() == [0, 0, 0, 0, 1, 0]
+
+
+def test_a_copy_of_the_game_and_the_evaluator_keep_its_rules(
+    env: BatchedEnv, mdp: OvercookedGridworld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the form that docs/evaluation.md names."""
+    monkeypatch.setattr(np, "Inf", np.inf, raising=False)
+    from overcooked_ai_py.agents.benchmarking import AgentEvaluator
+
+    made = mdp.copy()
+    assert type(made) is type(mdp) and getattr(made, "old_dynamics", False) == (env.cooking == "auto")
+    _, actions, reward = cooked_game(env)
+    pair = AgentPair(*(OvercookedAgent(Recorded(actions), env) for _ in (0, 1)))
+    played = AgentEvaluator({"horizon": STEPS}, lambda _: mdp).evaluate_agent_pair(pair, num_games=1, info=False)
+    assert played["ep_returns"].tolist() == [reward] and reward >= 60
 
 
 def test_a_game_with_many_soups_is_the_same_in_either_game(env: BatchedEnv, mdp: OvercookedGridworld) -> None:

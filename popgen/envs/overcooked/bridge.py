@@ -40,6 +40,12 @@ class AutomaticGridworld(OvercookedGridworld):
 
     old_dynamics = True
 
+    def copy(self) -> AutomaticGridworld:
+        """The same game; overcooked_ai's own copy would be one without automatic cooking."""
+        made = super().copy()
+        made.__class__ = AutomaticGridworld
+        return made
+
     def soup_to_be_cooked_at_location(self, state: Any, pos: tuple[int, int]) -> bool:
         """No interact starts a pot."""
         return False

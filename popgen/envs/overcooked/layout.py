@@ -135,7 +135,7 @@ def _layout_folder() -> Path | None:
 
 
 def _from_file(layout: str) -> Layout:
-    path = Path(str(layout))
+    path = Path(str(layout)).expanduser()
     named = path.suffix != ".layout" and len(path.parts) == 1
     if named:
         folder = _layout_folder()

@@ -186,6 +186,7 @@ class RllibTraining:
         scores = algorithm.scores(member)
         extra = {**scores, "iterations": algorithm.rounds, "seconds": round(seconds / len(self.learning), 1)}
         parts = ", ".join(f"{name.upper()} {value:.2f}" for name, value in scores.items())
+        parts = f"{parts} {self.spec.score_name}" if parts else "no whole episode"
         steps = f"{self.progress.steps[member]:,} environment steps"
         return TrainedMember(
             member,
@@ -194,7 +195,7 @@ class RllibTraining:
             seed=self.config.run.seed * 1000 + member,
             extra=extra,
             left={"sequence": self.progress.sequence},
-            note=f"member {member}: {parts} {self.spec.score_name} in training, {steps}, {seconds / 60:.1f} min",
+            note=f"member {member}: {parts} in training, {steps}, {seconds / 60:.1f} min",
         )
 
     def _count_seconds(self) -> float:
