@@ -162,7 +162,7 @@ def test_bad_arguments_are_refused_in_one_line(case: str, run: Run) -> None:
 BAD_FOR_THE_POPULATION = {
     "another layout": (["--env", "overcooked/coordination_ring"], "overcooked/cramped_room"),
     "another cooking mode": (["--param", "cooking=interact"], "interact"),
-    "another horizon": (["--param", "horizon=400"], "overcooked/cramped_room"),
+    "another horizon": (["--param", "horizon=400"], "env.params.horizon: is 400, the population was trained with 20"),
     "unknown layout": (["--env", "overcooked/nowhere"], "nowhere"),
     "unknown member": (["--members", "1,3"], "member 3"),
     "reserved parameter": (["--param", "layout=x"], "env.params.layout"),

@@ -66,7 +66,7 @@ def test_options_and_paths_of_every_command(home: str, run: Run, random_populati
         "seed=choice(1,2)",
         "agent.lambda_xp=interval(0,1)",
         "env=glob(*)",
-        "scale=demo,smoke",
+        "scale=a,b",
     ],
 )
 def test_several_values_are_told_as_such(word: str, run: Run) -> None:
