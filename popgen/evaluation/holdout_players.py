@@ -1,14 +1,14 @@
 """Who plays in a hold-out evaluation: egos, hold-out partners, and the proof that they have nothing in common.
 
 A group is one name: an ego with its seeds, or the partners of one kind. A player is one policy of a group. An ego is an
-ordinary population folder; what it was trained beside stands in the record of its members under `trained_with`, a list
-of objects with the keys method, seed, config_digest and policy_sha256 (a list), one for each population.
+ordinary population folder; what it was trained beside stands in the record of its members under `trained_with`: a list
+of objects, one for each partner, with the keys method, population_seed, config_digest and policy_sha256 among others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -173,21 +173,17 @@ def _open_member(population: Population, member: int) -> Callable[[], Policy]:
 
 
 def read_partners(place: str, extra: Mapping[str, Any]) -> list[Lineage]:
-    """Lineages of the populations that a member was trained with, by its record.
+    """Lineages of the members that a member was trained with, by its record, one for each population.
 
     Raises:
         UserError: the record holds something else.
     """
+    met: dict[Lineage, set[str]] = {}
     try:
-        return [
-            Lineage(
-                str(one["method"]),
-                int(one["seed"]),
-                str(one["config_digest"]),
-                frozenset(map(str, one["policy_sha256"])) - {NO_WEIGHTS},
-            )
-            for one in extra.get(TRAINED_WITH) or []
-        ]
+        for one in extra.get(TRAINED_WITH) or []:
+            source = Lineage(str(one["method"]), int(one["population_seed"]), str(one["config_digest"]))
+            met.setdefault(source, set()).add(str(one["policy_sha256"]))
+        return [replace(source, digests=frozenset(digests) - {NO_WEIGHTS}) for source, digests in met.items()]
     except (KeyError, TypeError, ValueError, AttributeError):
         raise UserError(place, f"{TRAINED_WITH} of a member cannot be read", "restore it from a good copy") from None
 
