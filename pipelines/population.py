@@ -26,7 +26,7 @@ from popgen.methods.transport import InlineTransport, Transport
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import load_population
 from popgen.progress import Reporter
-from popgen.reports.crossplay_report import to_dict, write_report
+from popgen.reports.crossplay_report import list_warnings, to_dict, write_report
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_figures import write_run_figures
 from popgen.runs.directory import RunState, named, run_folder
@@ -54,7 +54,8 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
 
     Returns:
         run_id, run_dir, population (path), members (count), ledger (steps by member and kind), matrix and evaluation
-        (`popgen.reports.crossplay_report`), files (paths by name or suffix), seconds.
+        (`popgen.reports.crossplay_report`), warnings (what of it speaks against low cross-play, in sentences), files
+        (paths by name or suffix), seconds.
 
     Raises:
         UserError: training diverged, the disk is (nearly) full, a checkpoint to continue from is damaged, another
@@ -196,7 +197,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     )
     files = write_report(result, recorder.dir / "report")
     size = len(recorder.population)
-    episodes = result.episodes * len(result.pairings)
+    episodes = result.count_episodes()
     recorder.record_evaluation(size, result.steps, episodes)
     title = f"{spec.name}, {title_of(config.method)}, seed {config.run.seed}"
     files |= write_run_figures(
@@ -214,6 +215,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         "ledger": recorder.ledger.table(),
         "matrix": evaluation["matrix"],
         "evaluation": evaluation,
+        "warnings": list_warnings(evaluation),
         "files": {suffix: str(file) for suffix, file in files.items()},
         "seconds": round(time.time() - recorder.began, 1),
     }

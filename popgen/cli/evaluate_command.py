@@ -96,7 +96,7 @@ def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
     out = Path(args.out) if args.out else Path(path) / "evaluation"
     check_root(out, 16 * 2**20, "--out")
     from popgen.evaluation.crossplay import evaluate_population
-    from popgen.reports.crossplay_report import matrix_sheet, summary, to_dict, write_report
+    from popgen.reports.crossplay_report import matrix_sheet, mixed_play_sheet, summary, to_dict, write_report
 
     with closing(make_reporter(quiet=args.quiet)) as reporter:
         reporter.phase("evaluation", 1)
@@ -111,8 +111,9 @@ def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
     if args.json:
         print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
         return OK
-    table = matrix_sheet(report, narrow=True).to_rich()
-    print_report([table], summary(report), str(out), [path.name for path in files.values()])
+    sheets = [matrix_sheet(report, narrow=True), mixed_play_sheet(report)]
+    tables = [sheet.to_rich() for sheet in sheets if sheet is not None]
+    print_report(tables, summary(report), str(out), [path.name for path in files.values()])
     return OK
 
 

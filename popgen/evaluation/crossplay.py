@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from popgen.errors import UserError
+from popgen.evaluation.estimates import Estimate, adjust_by_holm
+from popgen.evaluation.mixed_play import MixedPlay, play_mixed
 from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
 from popgen.play.rollout import play_teams
@@ -21,37 +23,8 @@ from popgen.population.store import Population
 RANDOM, IDLE = "random", "idle"
 PARTNERS = (RANDOM, IDLE)
 
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean and its standard error, NaN where one sample (or none) allows no estimate."""
-
-    mean: float
-    error: float
-
-    @classmethod
-    def of(cls, samples: np.ndarray) -> Estimate:
-        """Mean of independent samples (N,); error = s / sqrt(N) with the unbiased s."""
-        count = len(samples)
-        error = float(np.std(samples, ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-        return cls(float(np.mean(samples)) if count else math.nan, error)
-
-    @classmethod
-    def average(cls, parts: Sequence[Estimate]) -> Estimate:
-        """Mean of independent estimates, with equal weights; error = sqrt(sum of squares) / N."""
-        if not parts:
-            return cls(math.nan, math.nan)
-        error = math.sqrt(sum(part.error**2 for part in parts)) / len(parts)
-        return cls(float(np.mean([part.mean for part in parts])), error)
-
-    def to_dict(self) -> dict[str, float | None]:
-        """Keys mean and standard_error, as in every JSON report; None where unknown."""
-        values = {"mean": self.mean, "standard_error": self.error}
-        return {name: float(value) if math.isfinite(value) else None for name, value in values.items()}
-
-    def below(self, other: Estimate) -> bool:
-        """Lower than `other` by more than two standard errors of the difference; never where one is unknown."""
-        return self.mean < other.mean - 2 * math.hypot(self.error, other.error)
+LEVEL = 0.05
+"""Chance of any pair at all being called obstructive where none is."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +55,7 @@ class Obstruction:
         partner: `random` or `idle`.
         member: who of the two would do better with that partner in the other seat.
         xp, beside: scores of the pair, and of `member` with the partner.
+        p_value: that chance alone makes it as low, corrected for the number of comparisons (Holm).
     """
 
     pair: tuple[int, int]
@@ -89,6 +63,7 @@ class Obstruction:
     member: int
     xp: Estimate
     beside: Estimate
+    p_value: float
 
 
 @dataclass(frozen=True)
@@ -104,6 +79,8 @@ class CrossPlayResult:
         training_seed: of the population's run.
         steps: environment steps taken, kind `evaluation`.
         pairings: by label of seat 0 and seat 1.
+        mixed: self-play after cross-play, for each member, partner and seat.
+        mixed_episodes: that it took.
     """
 
     environment: EnvironmentInfo
@@ -116,6 +93,8 @@ class CrossPlayResult:
     training_seed: int
     steps: int
     pairings: dict[tuple[str, str], Pairing]
+    mixed: tuple[MixedPlay, ...] = ()
+    mixed_episodes: int = 0
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -161,20 +140,38 @@ class CrossPlayResult:
         return Estimate.average(parts)
 
     @property
-    def obstructions(self) -> tuple[Obstruction, ...]:
-        """Where cross-play is so low that a player must be in the other's way.
-
-        Members (i, j) in seats 0 and 1 are compared with i beside the random or idle player in seat 1 and with j
-        beside it in seat 0. Worse than these by more than two standard errors is sabotage, not another convention.
-        """
+    def comparisons(self) -> tuple[Obstruction, ...]:
+        """All that obstruction is judged by: members (i, j) in seats 0 and 1 against i beside the random or idle player
+        in seat 1, and against j beside it in seat 0."""
         found = []
         for i in self.members:
             for j in self.members:
                 for partner in PARTNERS if i != j else ():
                     for member, beside in ((i, self.score(i, partner)), (j, self.score(partner, j))):
-                        if self.score(i, j).below(beside):
-                            found.append(Obstruction((i, j), partner, member, self.score(i, j), beside))
-        return tuple(found)
+                        xp = self.score(i, j)
+                        found.append(Obstruction((i, j), partner, member, xp, beside, xp.chance_below(beside)))
+        adjusted = adjust_by_holm([one.p_value for one in found])
+        return tuple(replace(one, p_value=value) for one, value in zip(found, adjusted, strict=True))
+
+    @property
+    def obstructions(self) -> tuple[Obstruction, ...]:
+        """Where cross-play is so low that a player must be in the other's way: sabotage, not another convention.
+
+        The chance that any of these is there by chance alone is LEVEL; one episode a pair finds none.
+        """
+        return tuple(one for one in self.comparisons if one.p_value <= LEVEL)
+
+    def count_episodes(self) -> int:
+        """Episodes that were played in all, those of mixed play included."""
+        return self.episodes * len(self.pairings) + self.mixed_episodes
+
+    def share(self, member: int, seat: int, *, reset: bool = False) -> Estimate:
+        """What remains of a member's self-play after cross-play in which it had `seat`: mean over its partners.
+
+        NaN where it has none, or where its self-play scores nothing. `reset`: with its memory forgotten at the switch.
+        """
+        shares = [one.share(reset=reset) for one in self.mixed if (one.member, one.seat) == (member, seat)]
+        return Estimate.average([share for share in shares if math.isfinite(share.mean)])
 
     @property
     def obstruction(self) -> dict[str, bool]:
@@ -191,15 +188,14 @@ def evaluate_population(
     max_envs: int = 1024,
     progress: Callable[[int, int], None] | None = None,
 ) -> CrossPlayResult:
-    """Play all ordered pairs of members, and each member beside a random and an idle partner in both seats.
+    """Play all ordered pairs of members, each beside a random and an idle partner in both seats, and mixed play.
 
     Args:
         population: of at least one member.
         episodes: per ordered pair.
         seed: same arguments, same result.
         members: ids to evaluate, None for all.
-        max_envs: largest batch.
-        progress: called with (episodes done, episodes in all).
+        max_envs: largest batch. progress: called with (episodes done, episodes in all).
 
     Raises:
         UserError: no members, an unknown or repeated one, or less than 1 episode.
@@ -216,10 +212,9 @@ def evaluate_population(
     played = play_teams(
         population.make_env, policies, matches, episodes, seed=seed, max_envs=max_envs, progress=progress
     )
-    pairings = {}
-    for n, (i, j) in enumerate(matches):
-        rows = slice(n * episodes, (n + 1) * episodes)
-        pairings[labels[i], labels[j]] = _estimate_pairing((labels[i], labels[j]), played, rows)
+    mixed = play_mixed(population.make_env, dict(zip(chosen, policies, strict=False)), -(-episodes // 2), seed)
+    seats = [(labels[i], labels[j]) for i, j in matches]
+    rows = [slice(n * episodes, (n + 1) * episodes) for n in range(len(matches))]
     return CrossPlayResult(
         environment=population.env_info,
         method=population.manifest.method,
@@ -229,8 +224,10 @@ def evaluate_population(
         episodes=episodes,
         seed=seed,
         training_seed=population.manifest.seed,
-        steps=played.steps,
-        pairings=pairings,
+        steps=played.steps + mixed.steps,
+        pairings={pair: _estimate_pairing(pair, played, own) for pair, own in zip(seats, rows, strict=True)},
+        mixed=mixed.plays,
+        mixed_episodes=mixed.episodes,
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from popgen.envs.contract import BatchedEnv, EnvSpec
 from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
-from popgen.evaluation.crossplay import Estimate
+from popgen.evaluation.estimates import Estimate
 from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play

@@ -75,6 +75,21 @@ class Seating:
         """Mark the rows (B,) bool that were reset: their next step is the first of an episode."""
         self._first = np.asarray(done, bool).copy()
 
+    def change_seats(self, rows: np.ndarray, seats: np.ndarray, forget: np.ndarray) -> None:
+        """From the next step on other players sit in some rows, of those that sit there already.
+
+        Whoever sat in a row has followed it with its memory, and goes on with that.
+
+        Args:
+            rows: (R,) int.
+            seats: (R, P) int, the policy's index for each seat.
+            forget: (R,) bool, the row's memories are to be forgotten, as if its episode began.
+        """
+        assert all(np.isin(new, old).all() for new, old in zip(seats, self.seats[rows], strict=True))
+        self.seats = self.seats.copy()
+        self.seats[rows] = seats
+        self._first[rows] |= forget
+
     def state(self) -> dict[str, Any]:
         """Everything to continue from exactly here: last actions, first steps and the policies' memories."""
         memories = {str(k): policy.memory() for k, policy in self._remembering_policies().items()}

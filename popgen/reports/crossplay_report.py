@@ -12,9 +12,13 @@ Keys of the JSON object (`to_json`); a figure is `{"mean": x, "standard_error": 
     sp, xp                   figures: mean self-play over members; mean cross-play over ordered pairs i != j
     matrix                   mean and standard_error, lists of rows: row = seat 0, column = seat 1
     beside                   random and idle: `both` seats, partner in `seat_0`, partner in `seat_1`, all figures
-    obstruction              random and idle: is xp below `beside.*.both` by more than two standard errors; pairs: for
-                             each ordered pair that is below a member's own play beside such a partner: pair, partner,
-                             member, xp and beside
+    obstruction              random and idle: is xp below `beside.*.both` by more than two standard errors; comparisons:
+                             how many single ones were made; level: the chance of finding any by chance alone; pairs:
+                             each that was found: pair, partner, member, xp, beside and p_value (corrected by Holm)
+    mixed_play               what remains of a member's self-play after cross-play: episodes; members: member, and
+                             seat_0, seat_1 (the seat it had before), each with kept and reset (its memory at the
+                             switch): shares as figures, and least (of its partners, kept); cases: member, partner,
+                             seat, kept, reset and ordinary (scores after the switch)
     event_names, event_weights
     pairs                    every pairing: seat_0, seat_1 (a member's number, "random" or "idle"), score, reward and
                              shaped_return (sum over seats) as figures; scores of the episodes; events: mean count per
@@ -26,6 +30,7 @@ Standard errors are over episodes; they say nothing of how other members would d
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -33,9 +38,9 @@ from typing import Any
 import pandas as pd
 
 from popgen.errors import UserError
-from popgen.evaluation.crossplay import PARTNERS, CrossPlayResult, Obstruction, Pairing
+from popgen.evaluation.crossplay import LEVEL, PARTNERS, CrossPlayResult, Obstruction, Pairing
 from popgen.jsonable import jsonable
-from popgen.reports.frames import Sheet, estimate_text, to_csv
+from popgen.reports.frames import Sheet, estimate_text, number_text, to_csv
 
 CSV_FIELDS = ("seat_0", "seat_1", "pairing", "figure", "seat", "mean", "standard_error", "episodes")
 """Long format: one figure a row. `pairing` is SP, XP, random or idle; `figure` is score, reward, shaped_return or
@@ -73,7 +78,13 @@ def to_dict(result: CrossPlayResult) -> dict[str, Any]:
             "standard_error": jsonable(result.to_frame("error").to_numpy().tolist()),
         },
         "beside": beside,
-        "obstruction": {**result.obstruction, "pairs": [_describe_obstruction(one) for one in result.obstructions]},
+        "obstruction": {
+            **result.obstruction,
+            "comparisons": len(result.comparisons),
+            "level": LEVEL,
+            "pairs": [_describe_obstruction(one) for one in result.obstructions],
+        },
+        "mixed_play": _describe_mixed(result),
         "event_names": list(result.event_names),
         "event_weights": list(result.event_weights),
         "pairs": [_describe_pairing(pairing) for pairing in result.pairings.values()],
@@ -87,7 +98,30 @@ def _describe_obstruction(one: Obstruction) -> dict[str, Any]:
         "member": one.member,
         "xp": one.xp.to_dict(),
         "beside": one.beside.to_dict(),
+        "p_value": one.p_value,
     }
+
+
+def _describe_mixed(result: CrossPlayResult) -> dict[str, Any]:
+    cases = [
+        {
+            **{"member": one.member, "partner": one.partner, "seat": one.seat},
+            **{"kept": one.kept.to_dict(), "reset": one.reset.to_dict(), "ordinary": one.ordinary.to_dict()},
+        }
+        for one in result.mixed
+    ]
+    members = [
+        {"member": member, **{f"seat_{seat}": _describe_shares(result, member, seat) for seat in (0, 1)}}
+        for member in (result.members if cases else ())
+    ]
+    return {"episodes": -(-result.episodes // 2), "members": members, "cases": cases}
+
+
+def _describe_shares(result: CrossPlayResult, member: int, seat: int) -> dict[str, Any]:
+    own = [one.share().mean for one in result.mixed if (one.member, one.seat) == (member, seat)]
+    known = [share for share in own if math.isfinite(share)]
+    ways = {"kept": result.share(member, seat), "reset": result.share(member, seat, reset=True)}
+    return {**{name: share.to_dict() for name, share in ways.items()}, "least": min(known) if known else None}
 
 
 def _describe_pairing(pairing: Pairing) -> dict[str, Any]:
@@ -127,7 +161,7 @@ def _list_figures(result: CrossPlayResult) -> Iterator[dict[str, Any]]:
 
 def summary(report: Mapping[str, Any]) -> list[str]:
     """The headline figures of the JSON object, a line of plain text each."""
-    unit, beside, low = report["unit"], report["beside"], report["obstruction"]
+    unit, beside = report["unit"], report["beside"]
     lines = [f"SP mean {estimate_text(report['sp'])} {unit}", f"XP mean {estimate_text(report['xp'])} {unit}"]
     for partner in PARTNERS:
         row = beside[partner]
@@ -135,15 +169,77 @@ def summary(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"beside {partner} {estimate_text(row['both'])} {unit} ({parts})")
     if report["episodes"] == 1:
         lines.append("obstruction: not judged, since one episode has no standard error; ask for more episodes")
-    blocked = [partner for partner in PARTNERS if low[partner]]
-    if blocked:
-        lines.append(f"obstruction: XP is below play beside {' and '.join(blocked)} partners")
-    pairs = sorted({tuple(one["pair"]) for one in low["pairs"]})
-    if pairs:
-        names = ", ".join(f"{i}-{j}" for i, j in pairs)
-        lines.append(f"pairs (seat 0-seat 1) worse than a random or idle partner: {names}")
+    lines += list_warnings(report)
+    if shares := _list_shares(report):
+        means = [f"{name} {min(values):.2f} to {max(values):.2f}" for name, values in shares.items()]
+        lines.append(f"self-play that remains after cross-play, by member: {', '.join(means)}")
     lines.append(f"{report['episodes']} episodes per pair, {report['steps']['evaluation']:,} environment steps")
     return lines
+
+
+GOOD_SHARE = 0.9
+"""Share of ordinary self-play below which a member's play after cross-play is flagged."""
+
+_SHOWN = 10
+"""Pairs that a line names."""
+
+
+def list_warnings(report: Mapping[str, Any]) -> list[str]:
+    """What speaks against low cross-play as a sign of different conventions, a line each; empty where nothing does."""
+    low, lines = report["obstruction"], []
+    if blocked := [partner for partner in PARTNERS if low[partner]]:
+        lines.append(f"obstruction: XP is below play beside {' and '.join(blocked)} partners")
+    if pairs := sorted({tuple(one["pair"]) for one in low["pairs"]}):
+        size = len(report["members"])
+        names = ", ".join(f"{i}-{j}" for i, j in pairs[:_SHOWN]) + (", ..." if len(pairs) > _SHOWN else "")
+        count = f"{len(pairs)} of {size * (size - 1)} pairs"
+        lines.append(
+            f"obstruction: {count} are worse than a random or idle partner (p <= {low.get('level', LEVEL)}): {names}"
+        )
+    short = [
+        f"{one['member']} (seat {seat}: {share:.2f})"
+        for one in _list_mixed(report)
+        for seat in (0, 1)
+        if (share := one[f"seat_{seat}"]["kept"]["mean"]) is not None and share < GOOD_SHARE
+    ]
+    if short:
+        more = ", ..." if len(short) > _SHOWN else ""
+        told = f"members with less than {GOOD_SHARE} of their self-play after cross-play"
+        lines.append(f"{told}: {', '.join(short[:_SHOWN])}{more}")
+    return lines
+
+
+def _list_mixed(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Members' shares; none in a report of an older version."""
+    return report.get("mixed_play", {}).get("members", [])
+
+
+def _list_shares(report: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Way of going on and seat -> the members' shares; nothing where none is known."""
+    found: dict[str, list[float]] = {}
+    for one in _list_mixed(report):
+        for seat in (0, 1):
+            for way in ("kept", "reset"):
+                share = one[f"seat_{seat}"][way]["mean"]
+                if share is not None:
+                    found.setdefault(f"seat {seat}, memory {way}", []).append(share)
+    return found
+
+
+def mixed_play_sheet(report: Mapping[str, Any]) -> Sheet | None:
+    """Shares of self-play after cross-play, a member a row; None where there are none."""
+    cells = []
+    for one in _list_mixed(report):
+        row = {"member": str(one["member"])}
+        for seat in (0, 1):
+            here = one[f"seat_{seat}"]
+            row |= {f"seat {seat} {way}": estimate_text(here[way]) for way in ("kept", "reset")}
+            row[f"least {seat}"] = number_text(here["least"])
+        cells.append(row)
+    if not cells:
+        return None
+    title = "share of ordinary self-play after cross-play, by seat; memory kept, reset; least of its partners"
+    return Sheet(title, pd.DataFrame(cells))
 
 
 def matrix_sheet(report: Mapping[str, Any], *, narrow: bool = False) -> Sheet:
@@ -160,7 +256,9 @@ def matrix_sheet(report: Mapping[str, Any], *, narrow: bool = False) -> Sheet:
 def to_markdown(report: Mapping[str, Any]) -> str:
     """The matrix and the headline figures."""
     sheet = matrix_sheet(report)
-    lines = [sheet.title, "", sheet.to_markdown(), "", *(f"- {line}" for line in summary(report))]
+    mixed = mixed_play_sheet(report)
+    more = [] if mixed is None else [mixed.title, "", mixed.to_markdown(), ""]
+    lines = [sheet.title, "", sheet.to_markdown(), "", *more, *(f"- {line}" for line in summary(report))]
     return "\n".join(lines) + "\n"
 
 

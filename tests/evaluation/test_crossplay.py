@@ -9,7 +9,8 @@ import pytest
 from support.scripted import HORIZON, ONE, STAY, TWO, Cast, Script
 
 from popgen.errors import UserError
-from popgen.evaluation.crossplay import CrossPlayResult, Estimate, Obstruction, Pairing, evaluate_population
+from popgen.evaluation.crossplay import CrossPlayResult, Obstruction, Pairing, evaluate_population
+from popgen.evaluation.estimates import Estimate
 from popgen.population import load_population
 
 
@@ -60,7 +61,8 @@ def test_rows_are_seat_0_and_columns_seat_1() -> None:
     assert got.pairings["1", "2"].reward.mean == 132 and got.pairings["1", "2"].shaped.mean == 6 + 15
     assert got.beside("idle", 1).mean == 6 and got.beside("idle", 0).mean == 60 and got.beside("idle").mean == 33
     assert 6 <= got.score(1, "random").mean <= 126 and got.score(1, "random").error > 0
-    assert len(got.pairings) == 2 * 2 + 2 * 2 * 2 and got.steps == 12 * 4 * HORIZON
+    assert len(got.pairings) == 2 * 2 + 2 * 2 * 2
+    assert got.steps == (12 * 4 + got.mixed_episodes) * HORIZON and got.mixed_episodes == (2 + 4) * 2
 
 
 def test_the_frame_names_its_seats_and_can_hold_the_partners() -> None:
@@ -103,10 +105,9 @@ def test_obstruction_is_xp_below_play_with_a_random_or_idle_partner() -> None:
     assert result(scores(xp=1.0, random=1.2, idle=0.0), (1, 2)).obstructions == ()  # within two errors
     got = result(scores(xp=1.0, random=2.0, idle=0.0), (1, 2))
     xp, beside = Estimate(1.0, 0.1), Estimate(2.0, 0.1)
-    assert got.obstructions == (
-        Obstruction((1, 2), "random", 1, xp, beside),
-        Obstruction((1, 2), "random", 2, xp, beside),
-    )
+    p = 8 * xp.chance_below(beside)  # of eight comparisons; the second least counts no less than the least
+    assert 0 < p < 1e-10
+    assert got.obstructions == tuple(Obstruction((1, 2), "random", member, xp, beside, p) for member in (1, 2))
     assert got.obstruction == {"random": False, "idle": False}  # mean XP is 3
     assert result(scores(xp=1.0, random=3.5, idle=3.4), (1, 2)).obstruction == {"random": True, "idle": True}
     assert result(scores(xp=1.0, random=2.0, idle=3.4), (1, 2)).obstruction == {"random": False, "idle": True}

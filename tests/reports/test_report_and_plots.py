@@ -51,7 +51,7 @@ def test_json_holds_the_documented_keys(result: CrossPlayResult) -> None:
     assert set(told) == {key.strip() for line in documented for key in line.split(",")}
     assert told["matrix"]["mean"] == [[6, 126], [12, 132]] and told["matrix"]["standard_error"] == [[0, 0], [0, 0]]
     assert told["sp"] == {"mean": 69, "standard_error": 0} and told["xp"]["mean"] == 69
-    assert told["steps"] == {"evaluation": 12 * 3 * HORIZON} and told["unit"] == "points"
+    assert told["steps"] == {"evaluation": (12 * 3 + 6 * 2) * HORIZON} and told["unit"] == "points"
     assert told["beside"]["idle"]["seat_1"]["mean"] == (6 + 12) / 2
     assert told["beside"]["idle"]["seat_0"]["mean"] == (0 + 120) / 2
     assert len(told["pairs"]) == 12 and len(told["pairs"][0]["scores"]) == 3
@@ -125,7 +125,8 @@ def test_summary_names_obstruction() -> None:
     got = evaluate_population(Cast(helpful, blocking), 20, 0)  # type: ignore[arg-type]
     lines = report.summary(report.to_dict(got))
     # Seat 1 counts ten times: with `blocking` there, member 1 does worse than beside a random partner.
-    assert "pairs (seat 0-seat 1) worse than a random or idle partner: 1-2" in lines, lines
+    told = "obstruction: 1 of 2 pairs are worse than a random or idle partner (p <= 0.05): 1-2"
+    assert told in lines and told in report.list_warnings(report.to_dict(got)), lines
     assert {(found.pair, found.partner, found.member) for found in got.obstructions} == {((1, 2), "random", 1)}
 
 

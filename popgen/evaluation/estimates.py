@@ -1,0 +1,71 @@
+"""Means with their standard errors, and the correction of p-values for their number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean and its standard error, NaN where one sample (or none) allows no estimate."""
+
+    mean: float
+    error: float
+
+    @classmethod
+    def of(cls, samples: np.ndarray) -> Estimate:
+        """Mean of independent samples (N,); error = s / sqrt(N) with the unbiased s."""
+        count = len(samples)
+        error = float(np.std(samples, ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+        return cls(float(np.mean(samples)) if count else math.nan, error)
+
+    @classmethod
+    def average(cls, parts: Sequence[Estimate]) -> Estimate:
+        """Mean of independent estimates, with equal weights; error = sqrt(sum of squares) / N."""
+        if not parts:
+            return cls(math.nan, math.nan)
+        error = math.sqrt(sum(part.error**2 for part in parts)) / len(parts)
+        return cls(float(np.mean([part.mean for part in parts])), error)
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Keys mean and standard_error, as in every JSON report; None where unknown."""
+        values = {"mean": self.mean, "standard_error": self.error}
+        return {name: float(value) if math.isfinite(value) else None for name, value in values.items()}
+
+    def below(self, other: Estimate) -> bool:
+        """Lower than `other` by more than two standard errors of the difference; never where these are unknown."""
+        return self.mean < other.mean - 2 * math.hypot(self.error, other.error)
+
+    def chance_below(self, other: Estimate) -> float:
+        """One-sided p-value of being lower than `other` (normal approximation); NaN without errors to judge by."""
+        error, difference = math.hypot(self.error, other.error), self.mean - other.mean
+        if not math.isfinite(error) or not math.isfinite(difference):
+            return math.nan
+        if error == 0.0:
+            return 0.0 if difference < 0.0 else 1.0
+        return 0.5 * math.erfc(-difference / error / math.sqrt(2.0))
+
+    def divide(self, other: Estimate) -> Estimate:
+        """Ratio of two independent estimates, error by the delta method; NaN where `other` is not above 0."""
+        if not other.mean > 0.0:
+            return Estimate(math.nan, math.nan)
+        ratio = self.mean / other.mean
+        return Estimate(ratio, math.hypot(self.error, ratio * other.error) / other.mean)
+
+
+def adjust_by_holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's step-down adjusted p-values, in the given order; NaN stays and counts in the number of tests.
+
+    Rejecting where the adjusted value is at most alpha keeps the chance of any false rejection at alpha.
+    """
+    adjusted = [math.nan] * len(p_values)
+    known = [n for n, value in enumerate(p_values) if math.isfinite(value)]
+    highest = 0.0
+    for rank, n in enumerate(sorted(known, key=lambda n: p_values[n])):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[n]))
+        adjusted[n] = highest
+    return adjusted
