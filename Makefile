@@ -22,7 +22,7 @@ test: install  ## all tests
 test-fast: install  ## the tests without Ray (the oracle plays 4,000 steps of each layout, not 20,000)
 	POPGEN_ORACLE_STEPS=4000 $(PYTEST) -m "not ray"
 
-lint: install docs  ## style and documentation (types: `make types`)
+lint: install docs types  ## style, types and documentation
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 

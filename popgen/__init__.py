@@ -11,7 +11,7 @@ _LAZY = {
     "make_env": "popgen.envs",
     "recipe": "popgen.methods.registry",
 }
-__all__ = ["__version__", *_LAZY]
+__all__ = ["__version__", *_LAZY]  # pyright: ignore[reportUnsupportedDunderAll] (`__getattr__` has them)
 
 
 def __getattr__(name: str) -> Any:

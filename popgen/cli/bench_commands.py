@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from popgen.cli.arguments import Parser, add_command, at_least, numbers, positive
 from popgen.cli.compose import compose
@@ -14,6 +14,8 @@ from popgen.cli.training import before_ray
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
+
+C = TypeVar("C", bound="RunConfig")
 
 
 def add(commands: Any) -> None:
@@ -69,7 +71,9 @@ def bench_env(args: argparse.Namespace) -> int:
 
 def bench_mappo(args: argparse.Namespace) -> int:
     """Environment steps a second of MAPPO's training."""
-    config = _checked([*args.overrides, "method=mappo"])
+    from popgen.methods.mappo.config import MappoRun
+
+    config = _check_run(MappoRun, [*args.overrides, "method=mappo"])
     from popgen.pipelines.bench_mappo import bench_mappo as measure
 
     result = measure(config, seconds=args.seconds)
@@ -84,7 +88,9 @@ def bench_mappo(args: argparse.Namespace) -> int:
 
 def bench_scale(args: argparse.Namespace) -> int:
     """Environment steps a second with several samplers."""
-    config = _checked([*args.overrides, "method=xpm_wm"])
+    from popgen.methods.xpm_wm.config import XpmWmRun
+
+    config = _check_run(XpmWmRun, [*args.overrides, "method=xpm_wm"])
     from popgen.pipelines.bench_scale import bench_scale as measure
 
     tell = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
@@ -96,11 +102,12 @@ def bench_scale(args: argparse.Namespace) -> int:
     return OK
 
 
-def _checked(overrides: list[str]) -> RunConfig:
-    from popgen.config.run_config import RunConfig
+def _check_run(schema: type[C], overrides: list[str]) -> C:
+    """A run of the method that `overrides` name and whose schema is given."""
     from popgen.runs.preflight import preflight
 
-    config = RunConfig.parse(compose(overrides))
+    config = schema.parse(compose(overrides))
+    assert isinstance(config, schema)
     preflight(config)
     before_ray(config.cluster.threads, config.cluster.address is None)
     return config

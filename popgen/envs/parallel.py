@@ -51,7 +51,8 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
         _check_choice("reward", reward, REWARDS)
         _check_choice("render_mode", render_mode, (None, *RENDER_MODES))
         self.env, self.view, self.reward, self.render_mode = env, view, reward, render_mode
-        self.metadata = {**type(self).metadata, "name": env.spec.name}
+        # PettingZoo declares a variable of the class; the name is known here first.
+        vars(self)["metadata"] = {**type(self).metadata, "name": env.spec.name}
         self.possible_agents = [f"player_{player}" for player in range(env.spec.num_players)]
         self.agents: list[str] = []
         seen = env.spec.views[view]

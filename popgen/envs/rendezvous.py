@@ -186,8 +186,8 @@ class RendezvousEnv(BatchedEnv):
 
     def _find_outcome(self, position: np.ndarray, time: np.ndarray) -> StepBatch:
         """What it gives to arrive at `position` (..., P, 2) at `time` (...)."""
-        left = (np.abs(position) > self.bounds).any(axis=-1)
-        exited, over = left.any(axis=-1), time >= self.horizon
+        left = np.asarray((np.abs(position) > self.bounds).any(axis=-1))
+        exited, over = np.asarray(left.any(axis=-1)), time >= self.horizon
         terminated = exited | over if self.ending == "terminal" else exited
         penalty = np.where(exited, np.maximum(self.horizon - time, 0.0) * self.exit_reward, 0.0)
         reward = np.asarray(reward_positions(position, self.landmarks, self.distance) + penalty, dtype=np.float32)
@@ -212,7 +212,7 @@ class RendezvousEnv(BatchedEnv):
 
     def generator_state(self) -> dict[str, Any]:
         """Of the generator of start positions."""
-        return self._rng.bit_generator.state
+        return dict(self._rng.bit_generator.state)
 
     def load_generator_state(self, state: dict[str, Any]) -> None:
         """Draw on from `generator_state()`."""
@@ -350,15 +350,16 @@ def _check_number(name: str, value: Any, low: float, high: float, *, above: bool
     """`value` as a float in [low, high], or in (low, high] with `above`; else UserError."""
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise UserError(f"env.{name}", f"must be a finite number, got {value!r}")
-    if not low <= value <= high or (above and value == low):
+    number = float(value)
+    if not low <= number <= high or (above and number == low):
         limits = f"above {low:g} and at most {high:g}" if above else f"from {low:g} to {high:g}"
         raise UserError(f"env.{name}", f"must be {limits}, got {value!r}")
-    return float(value)
+    return number
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> int:
     """`value` as an int in [low, high]; else UserError."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not low <= value <= high:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not low <= int(value) <= high:
         raise UserError(f"env.{name}", f"must be a whole number from {low} to {high}, got {value!r}")
     return int(value)
 

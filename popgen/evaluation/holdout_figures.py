@@ -158,10 +158,10 @@ def _bound_figure(values: np.ndarray, estimate: Callable[[np.ndarray], float] = 
 
 def _find_worst_pair(result: HoldoutResult, rows: Sequence[int], columns: Sequence[int]) -> Worst:
     means = result.scores[np.ix_(rows, columns)].mean(-1)
-    row, column, seat = np.unravel_index(int(means.argmin()), means.shape)
+    row, column, seat = (int(index) for index in np.unravel_index(int(means.argmin()), means.shape))
     ego = result.casting.ego_players[rows[row]]
     partner = result.casting.partner_players[columns[column]]
-    return Worst(float(means.min()), ego.name, partner.name, int(seat))
+    return Worst(float(means.min()), ego.name, partner.name, seat)
 
 
 def describe_all(result: HoldoutResult) -> list[Standing]:

@@ -45,7 +45,7 @@ def bound_advantage(
     """Cross-play's advantages, at most `clip` spreads of self-play's in size (0: as they are): so a large loss for the
     team, such as the penalty of leaving, is no larger gain than holding to another convention."""
     bound = spread * (clip or math.inf)
-    return advantage.clamp(-bound, bound)
+    return advantage.clamp(-float(bound), float(bound))
 
 
 def next_multiplier(multiplier: float, cross_play: float, self_play: float, *, limit: float, step: float) -> float:

@@ -15,6 +15,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Pending, Training
 
 W = TypeVar("W")
+W_co = TypeVar("W_co", covariant=True)
 T = TypeVar("T")
 P = ParamSpec("P")
 
@@ -28,10 +29,10 @@ class Place:
     with_driver: bool = False
 
 
-class Worker(Protocol[W]):
+class Worker(Protocol[W_co]):
     """A worker of class W, wherever it is."""
 
-    def ask(self, method: Callable[Concatenate[W, P], T], *arguments: P.args, **named: P.kwargs) -> Pending[T]:
+    def ask(self, method: Callable[Concatenate[W_co, P], T], *arguments: P.args, **named: P.kwargs) -> Pending[T]:
         """Have it do `method`, one call after the other in the order of asking."""
         ...
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -86,7 +86,9 @@ def same_form(value: Any, like: Any, name: str = "a part") -> None:
     if isinstance(like, dict):
         if not isinstance(value, dict) or value.keys() != like.keys():
             raise ValueError(f"{name} has other tensors")
-        for key, item in like.items():
+        for key, item in cast("dict[str, Any]", like).items():
             same_form(value[key], item, key)
-    elif not isinstance(value, np.ndarray) or (value.shape, value.dtype) != (like.shape, like.dtype):
+        return
+    array = cast("np.ndarray", value)
+    if not isinstance(value, np.ndarray) or (array.shape, array.dtype) != (like.shape, like.dtype):
         raise ValueError(f"{name} is of another shape or type")

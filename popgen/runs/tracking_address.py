@@ -60,7 +60,7 @@ def _check_server(uri: str, timeout: float) -> None:
     """By `requests`, which MLflow uses: it takes credentials, proxies and certificates from the same places."""
     import requests
 
-    login = tuple(os.environ.get(f"MLFLOW_TRACKING_{name}") for name in ("USERNAME", "PASSWORD"))
+    user, password = (os.environ.get(f"MLFLOW_TRACKING_{name}") for name in ("USERNAME", "PASSWORD"))
     trusted = os.environ.get("MLFLOW_TRACKING_SERVER_CERT_PATH") or (
         os.environ.get("MLFLOW_TRACKING_INSECURE_TLS", "false").lower() not in ("true", "1")
     )
@@ -70,7 +70,7 @@ def _check_server(uri: str, timeout: float) -> None:
             f"{uri.rstrip('/')}/health",
             timeout=timeout,
             verify=trusted,
-            auth=login if all(login) else None,
+            auth=(user, password) if user and password else None,
             stream=True,
         ).close()
     except (OSError, ValueError) as error:  # requests' own errors are of the first kind, bad addresses of the second

@@ -134,19 +134,19 @@ def to_overcooked_ai(env: OvercookedEnv, row: np.ndarray) -> OvercookedState:
         names = ["onion"] * mix[0] + ["tomato"] * mix[1]
         return SoupState(cell, [ObjectState(name, cell) for name in names], cooking_tick=tick)
 
-    row = [int(number) for number in row]
+    numbers = [int(number) for number in row]
     players = []
     for i in range(2):
-        cell = (row[i] % env.layout.width, row[i] // env.layout.width)
-        held = row[k.HELD + i]
-        players.append(PlayerState(cell, DIRECTIONS[row[k.ORIENT + i]], thing(held, cell) if held else None))
+        cell = (numbers[i] % env.layout.width, numbers[i] // env.layout.width)
+        held = numbers[k.HELD + i]
+        players.append(PlayerState(cell, DIRECTIONS[numbers[k.ORIENT + i]], thing(held, cell) if held else None))
     objects = {}
     for i, cell in enumerate(env.tables.pots):
-        if row[k.POTS + 2 * i]:
-            objects[cell] = thing(row[k.POTS + 2 * i], cell, row[k.POTS + 2 * i + 1])
+        if numbers[k.POTS + 2 * i]:
+            objects[cell] = thing(numbers[k.POTS + 2 * i], cell, numbers[k.POTS + 2 * i + 1])
     for i, cell in enumerate(env.tables.counters, start=k.POTS + 2 * len(env.tables.pots)):
-        if row[i]:
-            objects[cell] = thing(row[i], cell)
+        if numbers[i]:
+            objects[cell] = thing(numbers[i], cell)
     config = env.layout.config.get("start_state") or {
         "all_orders": env.layout.config.get("start_all_orders"),
         "bonus_orders": env.layout.config.get("start_bonus_orders"),
@@ -155,7 +155,7 @@ def to_overcooked_ai(env: OvercookedEnv, row: np.ndarray) -> OvercookedState:
         {"ingredients": _name_ingredients(soup)} for soup in env.rules.reward
     ]
     bonus = list(config.get("bonus_orders") or [])
-    return OvercookedState(players, objects, bonus, orders, timestep=row[k.TIME] + 256 * row[k.TIME + 1])
+    return OvercookedState(players, objects, bonus, orders, timestep=numbers[k.TIME] + 256 * numbers[k.TIME + 1])
 
 
 def _name_ingredients(soup: tuple[int, int]) -> list[str]:

@@ -10,12 +10,7 @@ only at the file of the compiled function.
 
 from __future__ import annotations
 
-from numba import njit
-
-from popgen.envs.overcooked.compiled_kernel import compile_kernel
-
-# `_nrt=False` below: the kernels allocate nothing, and without it numba counts references to every array at every
-# call of a helper, which made encoding six times slower
+from popgen.envs.overcooked.compiled_kernel import compile_helper, compile_kernel
 
 # bytes of the state row
 ORIENT, HELD, TIME, POTS = 2, 4, 6, 8
@@ -41,7 +36,7 @@ CHANNELS, C_TERRAIN, C_IN_POT, C_IN_SOUP, C_COOK, C_DONE, C_DISH, C_ONION, C_TOM
 URGENT_BELOW = 40
 
 
-@njit(_nrt=False)
+@compile_helper
 def _counter_pickup_event(item, table):
     """overcooked_ai's own log counts pick-ups from counters too."""
     if item == DISH:
@@ -49,13 +44,13 @@ def _counter_pickup_event(item, table):
     return _soup_pickup_event(item, table) if item >= FIRST_SOUP else TAKES_INGREDIENT
 
 
-@njit(_nrt=False)
+@compile_helper
 def _soup_pickup_event(soup, table):
     """A soup that the game does not pay for is no event: what it is worth is what training pays."""
     return TAKES_SOUP if table[DELIVERY, soup] >= 0 else NO_EVENT
 
 
-@njit(_nrt=False)
+@compile_helper
 def _use_pot(states, held, slot, table, auto):
     """Interact with the pot whose contents stand at `slot`; returns the event or NO_EVENT."""
     item, contents, cooking = states[held], states[slot], states[slot + 1]
@@ -77,7 +72,7 @@ def _use_pot(states, held, slot, table, auto):
     return NO_EVENT
 
 
-@njit(_nrt=False)
+@compile_helper
 def _resolve_interact(states, s, p, table, auto, raw):
     """Resolve player p's interact in the state at states[s:]; returns the event it causes, or NO_EVENT."""
     cell = table[FACE + (states[s + ORIENT + p] & 3), states[s + p]]
@@ -106,7 +101,7 @@ def _resolve_interact(states, s, p, table, auto, raw):
     return NO_EVENT
 
 
-@njit(_nrt=False)
+@compile_helper
 def _move_players(states, s, first, second, table):
     """Turn and move both players; if they would meet or cross, both stay where they are."""
     old0, old1 = states[s], states[s + 1]
@@ -122,7 +117,7 @@ def _move_players(states, s, first, second, table):
         states[s + 1] = new1
 
 
-@njit(_nrt=False)
+@compile_helper
 def _advance_pots(states, s, pots, table, auto):
     """Full pots begin by themselves under automatic cooking; cooking pots advance by one."""
     for slot in range(s + POTS, s + POTS + 2 * pots, 2):
@@ -167,7 +162,7 @@ def step(states, size, actions, table, values, meta, reward, score, events, trun
         truncated[n] = time >= horizon
 
 
-@njit(_nrt=False)
+@compile_helper
 def _set_item(out, at, other, item, table, bit_row):
     """Set the bits of an object at out[at:] and out[other:]; objects that cannot exist here have none."""
     for row in range(bit_row, bit_row + 3):
@@ -177,7 +172,7 @@ def _set_item(out, at, other, item, table, bit_row):
             out[other + bit] = 1
 
 
-@njit(_nrt=False)
+@compile_helper
 def _player_features(states, s, table, meta, out, at, other):
     """Players' part of both views, player 1's at out[at:] and player 2's at out[other:]; own entries first."""
     floor, items = meta[M_FLOOR], meta[M_ITEM]
@@ -195,7 +190,7 @@ def _player_features(states, s, table, meta, out, at, other):
             _set_item(out, mine + held, theirs + held + items, states[s + HELD + player], table, ITEM_BIT)
 
 
-@njit(_nrt=False)
+@compile_helper
 def _world_features(states, s, table, meta, out, at, other):
     """The part that is the same in both views, at out[at:] and out[other:]."""
     pots, cook, pot_bits, items = meta[M_POTS], meta[M_COOK], meta[M_POT], meta[M_ITEM]
@@ -238,13 +233,13 @@ def encode_features(states, size, table, meta, out):
         at += 2 * length
 
 
-@njit(_nrt=False)
+@compile_helper
 def _set_both(out, at, other, value):
     out[at] = value
     out[other] = value
 
 
-@njit(_nrt=False)
+@compile_helper
 def _lossless_soup(out, at, other, contents, cooking, table, idle):
     """A soup in a pot (idle or not), in a hand or on a counter, in both views."""
     first = C_IN_POT if idle else C_IN_SOUP
@@ -256,7 +251,7 @@ def _lossless_soup(out, at, other, contents, cooking, table, idle):
             _set_both(out, at + C_DONE, other + C_DONE, 1)
 
 
-@njit(_nrt=False)
+@compile_helper
 def _lossless_item(out, at, other, item, table):
     if item >= FIRST_SOUP:
         _lossless_soup(out, at, other, item, 1, table, False)
@@ -265,7 +260,7 @@ def _lossless_item(out, at, other, item, table):
         _set_both(out, at + channel, other + channel, 1)
 
 
-@njit(_nrt=False)
+@compile_helper
 def _lossless_players(states, s, table, out, at, other):
     for player in range(2):
         here = table[XFIRST, states[s + player]] * CHANNELS
@@ -278,7 +273,7 @@ def _lossless_players(states, s, table, out, at, other):
         _lossless_item(out, mine, theirs, states[s + HELD + player], table)
 
 
-@njit(_nrt=False)
+@compile_helper
 def _lossless_world(states, s, table, meta, walls, out, at, other):
     for i in range(walls.shape[0]):
         _set_both(out, at + walls[i], other + walls[i], 1)
@@ -316,7 +311,7 @@ def encode_lossless(states, size, table, meta, walls, out):
         at += 2 * length
 
 
-@njit(_nrt=False)
+@compile_helper
 def _first_set(features, start, count):
     for i in range(count):
         if features[start + i] != 0:
@@ -324,7 +319,7 @@ def _first_set(features, start, count):
     return -1
 
 
-@njit(_nrt=False)
+@compile_helper
 def _read_bits(features, start, count):
     value = 0
     for i in range(count):
@@ -333,7 +328,7 @@ def _read_bits(features, start, count):
     return value
 
 
-@njit(_nrt=False)
+@compile_helper
 def _decode_world(features, start, meta, codes, row):
     pots, pot_bits, cook, items = meta[M_POTS], meta[M_POT], meta[M_COOK], meta[M_ITEM]
     for i in range(pots):

@@ -131,7 +131,8 @@ def choose_cooking(layout: Layout, cooking: str | None) -> str:
 
 def _layout_folder() -> Path | None:
     spec = importlib.util.find_spec("overcooked_ai_py")
-    return Path(list(spec.submodule_search_locations)[0], "data", "layouts") if spec else None
+    places = spec.submodule_search_locations if spec else None
+    return Path(list(places)[0], "data", "layouts") if places else None
 
 
 def _from_file(layout: str) -> Layout:

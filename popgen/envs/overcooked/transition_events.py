@@ -11,10 +11,9 @@ compiled function; `_check_constants` compares them with those of kernels.py.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from popgen.envs.overcooked import kernels as k
-from popgen.envs.overcooked.compiled_kernel import compile_kernel
+from popgen.envs.overcooked.compiled_kernel import compile_helper, compile_kernel
 from popgen.envs.overcooked.env import OvercookedEnv
 
 EVENTS = (
@@ -106,13 +105,13 @@ def _check_constants() -> None:
 _check_constants()
 
 
-@njit(_nrt=False)
+@compile_helper
 def _object_event(first, item):
     """The event of an object's kind, in the order onion, tomato, dish, soup from `first` on."""
     return first + (3 if item >= FIRST_SOUP else item - 1)
 
 
-@njit(_nrt=False)
+@compile_helper
 def _count_waiting_pots(states, s, pots, table):
     """Pots that cook, are ready or are partly filled: those that will want a dish."""
     count = 0
@@ -122,7 +121,7 @@ def _count_waiting_pots(states, s, pots, table):
     return count
 
 
-@njit(_nrt=False)
+@compile_helper
 def _use_pot(held, contents, cooking, table, auto):
     """(event, what is in hand after) of an interact with a pot."""
     if held == 0:
@@ -134,7 +133,7 @@ def _use_pot(held, contents, cooking, table, auto):
     return IDLE_REFUSED, held
 
 
-@njit(_nrt=False)
+@compile_helper
 def _take(kind):
     """(event, what is in hand after) of empty hands at a dispenser; elsewhere nothing happens."""
     if kind == ONIONS:
@@ -146,7 +145,7 @@ def _take(kind):
     return IDLE_EMPTY, 0
 
 
-@njit(_nrt=False)
+@compile_helper
 def _interact(row, p, table, auto):
     """Resolve player p's interact in `row`, of which hands, pots' contents and counters change; returns the event."""
     cell = table[FACE + (row[ORIENT + p] & 3), row[p]]
@@ -178,7 +177,7 @@ def _interact(row, p, table, auto):
     return IDLE_EMPTY
 
 
-@njit(_nrt=False)
+@compile_helper
 def _dish_is_useful(row, waiting, first_counter):
     """Before a dish is taken at a dispenser; `waiting` pots are those before the step."""
     held = (1 if row[HELD] == DISH else 0) + (1 if row[HELD + 1] == DISH else 0)
@@ -188,7 +187,7 @@ def _dish_is_useful(row, waiting, first_counter):
     return held < waiting
 
 
-@njit(_nrt=False)
+@compile_helper
 def _moves(row, actions, table, out):
     """Directions chosen: events of both players; if they would meet or cross, neither walks."""
     new0 = table[NEXT + actions[0], row[0]] if actions[0] < STAY else row[0]

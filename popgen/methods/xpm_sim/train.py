@@ -98,7 +98,7 @@ class XpmSimTraining:
     def _score_episodes(self, episodes: list[Episode]) -> None:
         """Scores of the round, each partner's latest return in cross-play, and what follows for its multiplier."""
         events = rewards_events(self.spec)
-        met_now = {}
+        met_now: dict[int, float] = {}
         for partner in self.partners:
             met = [e for e in episodes if e.kind is Kind.XP and partner in e.members]
             self.strength.add(partner, [e.shaped if events else e.score for e in met])

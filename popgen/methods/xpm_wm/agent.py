@@ -190,6 +190,8 @@ class AgentLearner:
     def _imagined_rates(self, recent: Starts | None) -> np.ndarray | None:
         """(E,) events a step that the present policy imagines; None without states to start from."""
         starts = recent if recent is not None else self.starts
+        if starts is None:
+            return None
         rows = np.arange(len(starts)) if recent is not None else np.flatnonzero(starts.pool == NEW_SP)
         if not len(rows):
             return None

@@ -46,10 +46,10 @@ class Tally:
     @staticmethod
     def from_state(state: dict[str, Any]) -> Tally:
         """From `to_state()`, as it was read."""
-        arrays = (np.asarray(state[name], np.int64) for name in ("events", "own_events"))
-        table = (np.asarray(state[name], np.int64) for name in ("keys", "visits"))
+        names = ("events", "own_events", "keys", "visits")
+        events, own_events, keys, visits = (np.asarray(state[name], np.int64) for name in names)
         known = tuple(np.asarray(state["known"][str(part)], np.int64) for part in range(len(state["known"])))
-        return Tally(*arrays, int(state["own_steps"]), *table, known)
+        return Tally(events, own_events, int(state["own_steps"]), keys, visits, known)
 
 
 def part_weights(view: ViewSpec) -> tuple[np.ndarray, ...]:

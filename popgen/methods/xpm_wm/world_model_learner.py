@@ -225,6 +225,6 @@ class ModelLearner:
 def before_or_at(windows: Windows, events: tuple[int, ...]) -> np.ndarray:
     """(N, L) bool: one of the events led to this state or to an earlier one of the window; what led to the first is not
     looked at."""
-    happened = windows.events[..., list(events)].any((2, 3))
+    happened = np.asarray(windows.events[..., list(events)].any((2, 3)))
     happened[:, 0] = False
     return np.maximum.accumulate(happened, axis=1)
