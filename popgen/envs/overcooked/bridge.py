@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from contextlib import redirect_stderr
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class AutomaticGridworld(OvercookedGridworld):
         """The same game; overcooked_ai's own copy would be one without automatic cooking."""
         made = super().copy()
         made.__class__ = AutomaticGridworld
-        return made
+        return cast("AutomaticGridworld", made)
 
     def soup_to_be_cooked_at_location(self, state: Any, pos: tuple[int, int]) -> bool:
         """No interact starts a pot."""

@@ -181,24 +181,22 @@ class AgentLearner:
     def compare_with_real_play(self, tally: Tally, recent: Starts | None) -> dict[str, float]:
         """Take in what real play has shown; how often each event happens in it and in imagination from `recent`
         states of it, or from this member's self-play among the states to start from; figures of both."""
-        discovery = self.discovery
-        discovery.tally = tally
-        if not discovery.config.trust or (events := self._imagined_rates(recent)) is None:
+        self.discovery.tally = tally
+        if not self.discovery.config.trust or (events := self._imagined_rates(recent)) is None:
             return {}
-        return discovery.compare(events, tally)
+        return self.discovery.compare(events, tally)
 
     def _imagined_rates(self, recent: Starts | None) -> np.ndarray | None:
         """(E,) events a step that the present policy imagines; None without states to start from."""
-        starts = recent if recent is not None else self.starts
-        if starts is None:
+        if (starts := recent if recent is not None else self.starts) is None:
             return None
         rows = np.arange(len(starts)) if recent is not None else np.flatnonzero(starts.pool == NEW_SP)
         if not len(rows):
             return None
         rows = self.rng.choice(rows, self.discovery.config.trust_starts)
         start = start_latents(starts, rows, self.model_config.classes, self.device, self.dtype)
-        none = cross_play_seats(0, self.device)
-        act = joint_actor(self.networks.rollout_actor, None, len(rows), none, self.generator)
+        actor, alone = self.networks.rollout_actor, cross_play_seats(0, self.device)
+        act = joint_actor(actor, None, len(rows), alone, self.generator)
         imagined = imagine(self.model, act, start, self.config.horizon, self.generator)
         happened = self.model.event_probs(imagined.latent[1:]).unflatten(-1, (self.spec.num_players, -1)) > 0.5
         return happened.sum(2).float().mean((0, 1)).cpu().numpy().astype(np.float64)
