@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from contextlib import closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, to_yaml
 from popgen.cli.printing import OK, print_json, print_table
 from popgen.cli.training import before_ray, tell_notes
+
+if TYPE_CHECKING:
+    from popgen.config.run_config import RunConfig
 
 
 def add(commands: Any) -> None:
@@ -38,13 +41,23 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train a population and evaluate it, or say what would be done."""
     from popgen.config.run_config import RunConfig
+
+    return execute(RunConfig.parse(compose(args.overrides, args.config_dir)), args)
+
+
+def execute(config: RunConfig, args: argparse.Namespace) -> int:
+    """Do what a configuration says, in a process of its own where this is one; print the result.
+
+    Args:
+        config: checked by its schema.
+        args: own_process, dry_run, quiet, json.
+    """
     from popgen.progress import make_reporter
     from popgen.runs.directory import named, run_folder
     from popgen.runs.interruption import end_on_sigterm
     from popgen.runs.preflight import preflight
     from popgen.runs.supervisor import guarded
 
-    config = RunConfig.parse(compose(args.overrides, args.config_dir))
     if args.own_process and not args.dry_run:
         config = named(config)
         if (code := guarded(run_folder(config), config.cluster.retries)) is not None:

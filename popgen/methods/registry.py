@@ -31,6 +31,11 @@ BUILT_IN: dict[str, str] = {
     "fcp": "popgen.methods.mappo.method:FCP",
     "mep": "popgen.methods.mappo.method:MEP",
     "trajedi": "popgen.methods.mappo.method:TRAJEDI",
+    "hipt": "popgen.methods.ego.method:HIPT",
+    "ego_fcp": "popgen.methods.ego.method:FCP",
+    "br": "popgen.methods.ego.method:BR",
+    "sp": "popgen.methods.ego.method:SP",
+    "sp_aug": "popgen.methods.ego.method:SP_AUG",
 }
 """name -> `module:record`, imported when first needed."""
 

@@ -7,12 +7,36 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
+from torch import nn
 
 from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.nets.sampling import draw_by_multinomial
 from popgen.nets.weights import load_weights, weights_of
 from popgen.shapes import check
+
+
+class FeedForwardSeat(nn.Module):
+    """A feed-forward policy's step in one seat, without memory (`popgen.play.stacked_partners.Stackable`)."""
+
+    seats: torch.Tensor
+
+    def __init__(self, net: nn.Module, players: int) -> None:
+        super().__init__()
+        self.net = net
+        self.register_buffer("seats", torch.eye(players), persistent=False)
+
+    def forward(
+        self,
+        memory: torch.Tensor,
+        obs: torch.Tensor,
+        previous_actions: torch.Tensor,
+        is_first: torch.Tensor,
+        seat: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Memory (R, 0), obs (R, P, *shape), seats (R,) -> action logits (R, A) and the memory."""
+        index = seat.view(-1, *[1] * (obs.dim() - 1)).expand(-1, 1, *obs.shape[2:])
+        return self.net(obs.gather(1, index).squeeze(1), self.seats[seat]), memory
 
 
 class FeedForwardPolicy:
@@ -76,6 +100,15 @@ class FeedForwardPolicy:
         if self.greedy:
             return logits.argmax(-1).numpy().astype(np.uint8)
         return draw_by_multinomial(logits, self._generator).numpy().astype(np.uint8)
+
+    @property
+    def memory_size(self) -> int:
+        """There is no memory; see `popgen.play.stacked_partners.Stackable`."""
+        return 0
+
+    def seat_network(self) -> nn.Module | None:
+        """See `popgen.play.stacked_partners.Stackable`; a greedy policy draws no actions."""
+        return None if self.greedy else FeedForwardSeat(self.net, self._players)
 
     def config(self) -> dict[str, Any]:
         """Sizes, the view's name and the way to pick an action."""

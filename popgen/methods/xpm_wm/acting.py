@@ -22,6 +22,28 @@ from popgen.nets import weights as w
 _S = TypeVar("_S", bound=Schema)
 
 
+class WorldModelSeat(nn.Module):
+    """A member's step in one seat (`popgen.play.stacked_partners.Stackable`); its memory is h and z side by side."""
+
+    def __init__(self, latent_filter: LatentFilter, actor: Actor) -> None:
+        super().__init__()
+        self.filter, self.actor = latent_filter, actor
+
+    def forward(
+        self,
+        memory: torch.Tensor,
+        obs: torch.Tensor,
+        previous_actions: torch.Tensor,
+        is_first: torch.Tensor,
+        seat: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Memory (R, D + C * G), obs (R, P, *shape), actions (R, P), is_first and seats (R,) -> log-probabilities
+        (R, A) and the next memory."""
+        sizes = (self.filter.config.deter, self.filter.latent_size)
+        latent = self.filter.filter(Latent(*memory.split(sizes, -1)), obs, previous_actions, is_first)
+        return self.actor.log_probs(latent, seat), latent.flat()
+
+
 class WorldModelPolicy:
     """Filters the joint observation into (h, z) and acts on each seat's player-specific latent.
 
@@ -57,6 +79,15 @@ class WorldModelPolicy:
             )
             seats = torch.tensor([0, 1]).expand(len(is_first), 2)
             return self.actor.sample(self._latent.expand_players(), seats, self._generator).numpy().astype(np.uint8)
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers of a row's h and z; see `popgen.play.stacked_partners.Stackable`."""
+        return self._model.deter + self.filter.latent_size
+
+    def seat_network(self) -> nn.Module | None:
+        """See `popgen.play.stacked_partners.Stackable`; a filter that samples draws from a generator of its own."""
+        return WorldModelSeat(self.filter, self.actor) if self._model.imagination == "mode" else None
 
     def memory(self) -> dict[str, Any]:
         """The running episodes' latents and the generator; see `popgen.play.policy.Remembering`."""

@@ -1,0 +1,199 @@
+"""An ego's learner over a transport, and its partners out of populations."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.envs.contract import EnvSpec
+from popgen.errors import UserError
+from popgen.methods.ego.config import BrRun, EgoRun
+from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
+from popgen.methods.ego.partner_source import Partner
+from popgen.methods.ego.train import EgoTraining
+from popgen.methods.ego.workers import Iterations
+from popgen.methods.training import Pending, State
+from popgen.methods.transport import Place, Transport
+from popgen.nets.weights import Weights
+from popgen.play.policy import Policy
+from popgen.population import Population, check_compatible, load_population
+from popgen.population.store import MANIFEST
+
+
+@dataclass(frozen=True)
+class NamedMembers:
+    """Members of one population that an argument names.
+
+    Attributes:
+        population: loaded and checked.
+        members: from 1.
+        digest: of its manifest, which names all its members' digests.
+    """
+
+    population: Population
+    members: tuple[int, ...]
+    digest: str
+
+
+def read_partner(text: str) -> NamedMembers:
+    """PATH, or PATH:1,3 for some members only.
+
+    Raises:
+        UserError: no population, or no such member.
+    """
+    path, _, numbers = text.rpartition(":")
+    if not path or not numbers.replace(",", "").isdigit():
+        path, numbers = text, ""
+    population = load_population(path)
+    everyone = range(1, len(population) + 1)
+    members = tuple(int(number) for number in numbers.split(",") if number) or tuple(everyone)
+    if wrong := [member for member in members if member not in everyone]:
+        raise UserError("ego.partners", f"{path} has no member {wrong[0]}", f"it has {len(population)}")
+    if not members:
+        raise UserError("ego.partners", f"{path} has no members", "choose another population")
+    data = (population.path / MANIFEST).read_bytes()
+    return NamedMembers(population, members, hashlib.sha256(data).hexdigest())
+
+
+def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:
+    """All partners of a run, of its environment and unchanged since they were pinned.
+
+    Raises:
+        UserError: a population that is missing, changed or of another environment.
+    """
+    named = [read_partner(text) for text in config.ego.partners]
+    for one, text in zip(named, config.ego.partners, strict=True):
+        check_compatible(one.population, spec)
+        if config.ego.pinned and one.digest not in config.ego.pinned:
+            raise UserError("ego.partners", f"{text} has changed since the run began", "restore it or start a new run")
+    if isinstance(config, BrRun) and sum(len(one.members) for one in named) != 1:
+        count = sum(len(one.members) for one in named)
+        raise UserError("ego.partners", f"{count} members, but a best response has one partner", "name it: PATH:3")
+    return named
+
+
+def describe_partners(named: Sequence[NamedMembers]) -> list[Partner]:
+    """Where each of them comes from, in order; names are unique."""
+    partners: list[Partner] = []
+    for number, one in enumerate(named, 1):
+        manifest, population = one.population.manifest, one.population
+        for member in one.members:
+            info = population.info(member)
+            name = f"{manifest.method}_{manifest.seed}/{member}"
+            if any(partner.name == name for partner in partners):
+                name = f"{number}.{name}"
+            source = (manifest.method, manifest.seed, manifest.config_digest, member, info.seed, info.policy_sha256)
+            partners.append(Partner(name, *source))
+    return partners
+
+
+def build_partners(named: Sequence[NamedMembers]) -> list[Policy]:
+    """Fresh policies in the order of `describe_partners`."""
+    return [one.population[member] for one in named for member in one.members]
+
+
+class EgoActor:
+    """Thin: every number is made by `EgoLearner`."""
+
+    def __init__(self, config: EgoRun, threads: int) -> None:
+        limit_threads(threads)
+        self.config = config
+        self._learner: EgoLearner | None = None
+
+    @property
+    def learner(self) -> EgoLearner:
+        """The running ego's.
+
+        Raises:
+            RuntimeError: none has begun.
+        """
+        if self._learner is None:
+            raise RuntimeError("begin_member comes first")
+        return self._learner
+
+    def begin_member(self, seed: int) -> None:
+        """Fresh networks, environments and partners."""
+        config = self.config
+        env = build_env(config.env, config.ego.envs, seed)
+        partners = build_partners(load_partners(config, env.spec))
+        self._learner = EgoLearner(EgoSetup.of_run(config), env, partners, seed)
+
+    def iterate(self, count: int) -> Iterations:
+        """So many rollouts with their updates."""
+        cpu, steps, episodes = time.process_time(), 0, []
+        began, totals = time.perf_counter(), defaultdict(list)
+        for _ in range(count):
+            figures, played, ended = self.learner.iterate()
+            steps, episodes = steps + played, episodes + ended
+            for name, value in figures.items():
+                totals[name].append(value)
+        means = {name: float(np.mean(values)) for name, values in totals.items()}
+        means["steps_per_second"] = steps / (time.perf_counter() - began)
+        return Iterations(means, steps, episodes, time.process_time() - cpu)
+
+    def acting(self) -> Weights:
+        """The ego's weights."""
+        return self.learner.policy.weights()
+
+    def critics(self) -> Weights:
+        """The critics' weights."""
+        return self.learner.training_weights()
+
+    def state(self) -> dict[str, Any]:
+        """Of the learner and the running episodes."""
+        return self.learner.state()
+
+    def load_state(self, state: State) -> None:
+        """Continue from `state()`, after `begin_member`."""
+        self.learner.load_state(state)
+
+
+class EgoWorkers:
+    """See `popgen.methods.ego.workers.Workers`."""
+
+    def __init__(self, config: EgoRun, transport: Transport) -> None:
+        cluster = config.cluster
+        self.learner = transport.start(EgoActor, Place(cluster.agent_cpus), config, cluster.threads)
+
+    def begin_member(self, seed: int) -> Pending[None]:
+        """The learner's."""
+        return self.learner.ask(EgoActor.begin_member, seed)
+
+    def iterate(self, count: int) -> Pending[Iterations]:
+        """The learner's."""
+        return self.learner.ask(EgoActor.iterate, count)
+
+    def acting(self) -> Pending[Weights]:
+        """The learner's."""
+        return self.learner.ask(EgoActor.acting)
+
+    def critics(self) -> Pending[Weights]:
+        """The learner's."""
+        return self.learner.ask(EgoActor.critics)
+
+    def state(self) -> Pending[State]:
+        """The learner's."""
+        return self.learner.ask(EgoActor.state)
+
+    def load_state(self, state: State) -> None:
+        """The learner's."""
+        self.learner.ask(EgoActor.load_state, state).result()
+
+    def end(self) -> None:
+        """End the learner."""
+        self.learner.end()
+
+
+def open_training(config: EgoRun, spec: EnvSpec, attempt: str, transport: Transport) -> EgoTraining:
+    """Start the worker of one attempt; see `popgen.methods.transport.OpenTraining`."""
+    partners = describe_partners(load_partners(config, spec))
+    policy = make_policy(EgoSetup.of_run(config), spec)
+    return EgoTraining(config, policy, spec.score_name, attempt, EgoWorkers(config, transport), partners)

@@ -1,0 +1,57 @@
+"""`popgen ego train`: an agent trained with populations."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from popgen.cli.arguments import Parser, add_command
+from popgen.cli.compose import compose
+from popgen.cli.run_command import execute
+from popgen.cli.training import bound_threads
+
+
+def add(commands: Any) -> None:
+    """`ego train`."""
+    ego = commands.add_parser("ego", help="agents trained with populations", description="Train with populations.")
+    kinds = ego.add_subparsers(title="what to do", metavar="WHAT", required=True, parser_class=Parser)
+    train = add_command(
+        kinds,
+        "train",
+        train_ego,
+        "train an ego beside the members of populations, or in self-play",
+        "method=hipt (default), fcp, br (one partner: PATH:3), sp or sp_aug (no POPULATION, but env=LAYOUT); the "
+        "environment is that of the populations. The result is a population of one. Exit codes and keys of --json: "
+        "those of `popgen run`.",
+    )
+    train.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="POPULATION|KEY=VALUE",
+        help="folders of populations, PATH:1,3 for some members only; settings as for `popgen run`",
+    )
+    train.add_argument(
+        "--dry-run", action="store_true", help="check everything, print the configuration, start nothing"
+    )
+
+
+def train_ego(args: argparse.Namespace) -> int:
+    """Train an ego, or say what would be done."""
+    bound_threads(1)
+    from popgen.config.run_config import RunConfig
+    from popgen.pipelines.ego_training import environment_of, pin_partners
+
+    partners = [word for word in args.overrides if "=" not in word]
+    overrides = [word for word in args.overrides if "=" in word]
+    keys = [word.lstrip("+").partition("=")[0] for word in overrides]
+    if "method" not in keys:
+        overrides.insert(0, "method=hipt")
+    info = environment_of(partners) if partners else None
+    if info is not None and not any(key == "env" or key.startswith("env.") for key in keys):
+        values = compose([*overrides, f"env.name={info.name}"])
+        values["env"] = {"name": info.name, "params": info.params}
+    else:
+        values = compose(overrides)
+    if partners:
+        values.setdefault("ego", {})["partners"] = partners
+    return execute(pin_partners(RunConfig.parse(values)), args)
