@@ -7,7 +7,6 @@ import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -74,8 +73,7 @@ def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:
         check_compatible(one.population, spec)
         if config.ego.pinned and one.digest not in config.ego.pinned:
             raise UserError("ego.partners", f"{text} has changed since the run began", "restore it or start a new run")
-    if isinstance(config, BrRun) and sum(len(one.members) for one in named) != 1:
-        count = sum(len(one.members) for one in named)
+    if isinstance(config, BrRun) and (count := sum(len(one.members) for one in named)) > 1:
         raise UserError("ego.partners", f"{count} members, but a best response has one partner", "name it: PATH:3")
     return named
 

@@ -285,9 +285,7 @@ class EgoSampler:
         nowhere = {"cut_at": torch.zeros(0, 2, dtype=torch.int64), "cut_judged": judged[:0], "cut_who": who[:0]}
         cuts = {name: torch.cat([empty, *columns.pop(name, [])]) for name, empty in nowhere.items()}
         stacked = {name: torch.stack(column) for name, column in columns.items()}
-        return Rollout(
-            **stacked, **cuts, choices=choices, episodes=episodes, steps=self.unroll * self.env.num_envs
-        )
+        return Rollout(**stacked, **cuts, choices=choices, episodes=episodes, steps=self.unroll * self.env.num_envs)
 
     # ---- checkpoints ---------------------------------------------------------------------------------------------
 

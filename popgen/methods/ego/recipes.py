@@ -76,7 +76,9 @@ def _make_recipes(own: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]])
     laptop = Recipe("laptop", "Two CPU cores, minutes an ego.", {**_HERE, **own}, by_layout)
     demo = Recipe("demo", "An ego that plays, in a minute or two.", {"ego.steps": 500_000}, base=laptop)
     smoke = Recipe("smoke", "Seconds, for tests: every code path once, nothing learned.", {**_HERE, **SMOKE_SETTINGS})
-    published = Recipe("paper", "HiPT's published network, budget and rates, for a GPU.", {**_HERE, **PAPER_SETTINGS}, paper)
+    published = Recipe(
+        "paper", "HiPT's published network, budget and rates, for a GPU.", {**_HERE, **PAPER_SETTINGS}, paper
+    )
     return {recipe.name: recipe for recipe in (laptop, demo, published, smoke)}
 
 
