@@ -50,6 +50,14 @@ class RandomPolicy:
         bounds = np.cumsum(self.probabilities)[:-1]  # the last bound may round to below 1
         return np.searchsorted(bounds, self._rng.random(size), side="right").astype(np.uint8)
 
+    def memory(self) -> dict[str, Any]:
+        """The generator; see `popgen.play.policy.Remembering`."""
+        return {"generator": self._rng.bit_generator.state}
+
+    def load_memory(self, memory: dict[str, Any]) -> None:
+        """Draw on from `memory()`."""
+        self._rng.bit_generator.state = memory["generator"]
+
     def config(self) -> dict[str, Any]:
         """The action probabilities, None for uniform."""
         return {"probabilities": self.probabilities}

@@ -128,7 +128,7 @@ class EgoNet(nn.Module):
         before = (F.one_hot(action, self.actions) * keep for action in (own, other))
         return torch.cat([F.one_hot(seat, self.players).float(), *before], -1)
 
-    def encode(self, obs: Shaped[Tensor, R * shape], extras: Float[Tensor, "R X"]) -> Float[Tensor, "R U"]:
+    def encode(self, obs: Shaped[Tensor, "R ..."], extras: Float[Tensor, "R X"]) -> Float[Tensor, "R U"]:
         """One seat's view and what goes with it."""
         values = obs.float()
         if self.scaled:
