@@ -16,7 +16,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.ego.config import BrRun, EgoRun
 from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
-from popgen.methods.ego.partner_source import Partner
+from popgen.methods.ego.partner_source import PartnerSource
 from popgen.methods.ego.train import EgoTraining
 from popgen.methods.ego.workers import Iterations
 from popgen.methods.training import Pending, State
@@ -78,23 +78,18 @@ def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:
     return named
 
 
-def describe_partners(named: Sequence[NamedMembers]) -> list[Partner]:
-    """Where each of them comes from, in order; names are unique."""
-    partners: list[Partner] = []
-    for number, one in enumerate(named, 1):
-        manifest, population = one.population.manifest, one.population
-        for member in one.members:
-            info = population.info(member)
-            name = f"{manifest.method}_{manifest.seed}/{member}"
-            if any(partner.name == name for partner in partners):
-                name = f"{number}.{name}"
-            source = (manifest.method, manifest.seed, manifest.config_digest, member, info.seed, info.policy_sha256)
-            partners.append(Partner(name, *source))
-    return partners
+def describe_partners(named: Sequence[NamedMembers]) -> list[PartnerSource]:
+    """Where they come from."""
+    sources: list[PartnerSource] = []
+    for one in named:
+        manifest = one.population.manifest
+        digests = tuple(one.population.info(member).policy_sha256 for member in one.members)
+        sources.append(PartnerSource(manifest.method, manifest.seed, manifest.config_digest, one.members, digests))
+    return sources
 
 
 def build_partners(named: Sequence[NamedMembers]) -> list[Policy]:
-    """Fresh policies in the order of `describe_partners`."""
+    """Fresh policies, in the order of the arguments and their members."""
     return [one.population[member] for one in named for member in one.members]
 
 
@@ -192,6 +187,6 @@ class EgoWorkers:
 
 def open_training(config: EgoRun, spec: EnvSpec, attempt: str, transport: Transport) -> EgoTraining:
     """Start the worker of one attempt; see `popgen.methods.transport.OpenTraining`."""
-    partners = describe_partners(load_partners(config, spec))
+    sources = describe_partners(load_partners(config, spec))
     policy = make_policy(EgoSetup.of_run(config), spec)
-    return EgoTraining(config, policy, spec.score_name, attempt, EgoWorkers(config, transport), partners)
+    return EgoTraining(config, policy, spec.score_name, attempt, EgoWorkers(config, transport), sources)

@@ -22,6 +22,20 @@ def ego_methods() -> list[str]:
     return [name for name, method in METHODS.items() if issubclass(method.config, EgoRun)]
 
 
+def find_ego_method(name: str) -> str:
+    """The method of the registry that a name means here: `fcp` is the ego of FCP, not the population.
+
+    Raises:
+        UserError: no ego is trained by it.
+    """
+    known = ego_methods()
+    found = next((one for one in (f"ego_{name}", name) if one in known), None)
+    if found is None:
+        shown = ", ".join(one.removeprefix("ego_") for one in known)
+        raise UserError("method", f"{name} trains no ego", f"choose one of {shown}")
+    return found
+
+
 def environment_of(partners: Sequence[str]) -> EnvironmentInfo:
     """The environment of the first population.
 
@@ -46,7 +60,7 @@ def make_ego_config(
     Raises:
         UserError: a method that trains no ego, a setting that does not exist, partners that do not fit.
     """
-    settings = dict(settings or {})
+    method, settings = find_ego_method(method), dict(settings or {})
     name = settings.get("env.name", "overcooked/cramped_room")
     if partners:
         info = environment_of(partners)
@@ -69,7 +83,7 @@ def pin_partners(config: RunConfig) -> EgoRun:
         UserError: no run of an ego, or a population that is missing or of another environment.
     """
     if not isinstance(config, EgoRun):
-        raise UserError("method", f"{config.method} trains no ego", f"choose one of {', '.join(ego_methods())}")
+        raise UserError("method", f"{config.method} trains no ego", "see popgen ego train --help")
     unpinned = config.model_copy(update={"ego": config.ego.model_copy(update={"pinned": ()})})
     named = load_partners(unpinned, make_env(config.env.name, 1, **config.env.params).spec)
     pinned = tuple(one.digest for one in named)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from popgen.cli.arguments import Parser, add_command
+from popgen.cli.arguments import Parser, add_command, add_config_dir
 from popgen.cli.compose import compose
 from popgen.cli.run_command import execute
 from popgen.cli.training import bound_threads
@@ -33,25 +33,26 @@ def add(commands: Any) -> None:
     train.add_argument(
         "--dry-run", action="store_true", help="check everything, print the configuration, start nothing"
     )
+    add_config_dir(train)
 
 
 def train_ego(args: argparse.Namespace) -> int:
     """Train an ego, or say what would be done."""
     bound_threads(1)
     from popgen.config.run_config import RunConfig
-    from popgen.pipelines.ego_training import environment_of, pin_partners
+    from popgen.pipelines.ego_training import environment_of, find_ego_method, pin_partners
 
     partners = [word for word in args.overrides if "=" not in word]
     overrides = [word for word in args.overrides if "=" in word]
     keys = [word.lstrip("+").partition("=")[0] for word in overrides]
-    if "method" not in keys:
-        overrides.insert(0, "method=hipt")
+    method = dict(word.partition("=")[::2] for word in overrides).get("method", "hipt")
+    overrides = [*(word for word in overrides if not word.startswith("method=")), f"method={find_ego_method(method)}"]
     info = environment_of(partners) if partners else None
     if info is not None and not any(key == "env" or key.startswith("env.") for key in keys):
-        values = compose([*overrides, f"env.name={info.name}"])
+        values = compose([*overrides, f"env.name={info.name}"], args.config_dir)
         values["env"] = {"name": info.name, "params": info.params}
     else:
-        values = compose(overrides)
+        values = compose(overrides, args.config_dir)
     if partners:
         values.setdefault("ego", {})["partners"] = partners
     return execute(pin_partners(RunConfig.parse(values)), args)

@@ -26,48 +26,61 @@ _Steps = Annotated[_Int, Field(ge=1, le=100_000)]  # of one rollout, sequence or
 
 
 class EgoConfig(Schema):
-    """Whom an ego is trained with, its network and PPO.
-
-    partners: folders of populations, each with `:1,3` behind it for some members only; `popgen ego train` fills it in.
-    pinned: the digests of these populations' manifests, in their order, which `popgen ego train` fills in: a run is
-        resumed with the same partners or not at all.
-    sampling: `uniform` gives every partner the same number of episodes in each seat; `prioritised` draws partner and
-        seat in proportion to rank(1 / return) ** priority, over a running mean of the returns that forgets 5 % of
-        itself with each episode.
-    network: `features_gru`, two linear layers and a GRU of `units` on the seat's features; `conv_lstm`, three
-        convolutions of `channels`, two linear layers and an LSTM on the seat's lossless view. Both see the seat and the
-        previous actions of both players.
-    head_units: of the actor's hidden layer. critic_units: of the critic's two, which sees the seat and the partner.
-    steps: of training. envs: stepped together. unroll: steps of each between two updates. sequence: steps through
-        which gradients flow back; the memory's state at their beginning is kept from the rollout.
-    learning_rate falls evenly to the share `learning_rate_end` of itself, entropy to `entropy_end`.
-    """
+    """Whom an ego is trained with, its network and PPO."""
 
     partners: tuple[Text, ...] = ()
+    """Folders of populations, each with `:1,3` behind it for some members only; `popgen ego train` fills it in."""
     pinned: tuple[str, ...] = ()
+    """Digests of these populations' manifests, in their order, which `popgen ego train` fills in: a run goes on with
+    the same partners or not at all."""
     sampling: Literal["uniform", "prioritised"] = "uniform"
+    """`uniform`: every partner has the same number of episodes in each seat; `prioritised`: partner and seat are drawn
+    in proportion to rank(1 / return) ** `priority`, by a running mean of which each return replaces 5 %."""
     priority: Weight = 0.5
+    """Exponent of prioritised sampling."""
     network: Literal["features_gru", "conv_lstm"] = "features_gru"
+    """`features_gru`: two linear layers and a GRU on the seat's features; `conv_lstm`: three convolutions, two linear
+    layers and an LSTM on its lossless view. Both see the seat and the previous actions of both players."""
     units: Width = 128
+    """Width of the linear layers and the memory."""
     channels: Width = 26
+    """Of each convolution."""
     head_units: Width = 64
+    """Width of the actor's hidden layer."""
     critic_units: Width = 128
+    """Width of the critic's two hidden layers; it sees the joint features, the seat and the partner's number."""
     steps: Positive = 4_000_000
+    """Environment steps of training."""
     envs: Batch = 128
+    """Environments stepped together."""
     unroll: _Steps = 100
+    """Steps of each environment between two updates."""
     sequence: _Steps = 50
+    """Steps through which gradients flow back; the memory before them is kept from the rollout."""
     epochs: Annotated[_Int, Field(ge=1, le=1000)] = 4
+    """Passes over the data of an update."""
     minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 4
+    """Gradient steps in each pass."""
     clip: Rate = 0.2
+    """Clipping of the probability ratio."""
     discount: Fraction = 0.99
+    """Of rewards, by step."""
     lam: Fraction = 0.95
+    """Lambda of the generalised advantages."""
     learning_rate: Rate = 1e-3
+    """Adam's, at the beginning."""
     learning_rate_end: Fraction = 0.1
+    """Share of it at the end, to which it falls evenly."""
     entropy: Weight = 0.01
+    """Weight of the actions' entropy at the beginning."""
     entropy_end: Fraction = 1.0
+    """Share of it at the end, to which it falls evenly."""
     value_weight: Weight = 0.5
+    """Weight of the critic's error, on the scale of normalised returns."""
     value_decay: Fraction = 0.95
+    """By which the moving mean and spread of returns forget, per update."""
     grad_clip: Weight = 0.5
+    """Most norm of a gradient; 0: any."""
 
     @model_validator(mode="after")
     def _batches_fit(self) -> EgoConfig:
@@ -80,25 +93,25 @@ class EgoConfig(Schema):
 
 
 class HiptConfig(Schema):
-    """The two levels of HiPT (Loo, Gong and Meghjani 2023).
-
-    skills: the high level chooses one of so many z. duration_least, duration_most: a z is kept for a number of steps
-        drawn evenly from these, both included.
-    influence: the high level is paid the mean over a segment's steps of reward + (1 - f) (influence - 1) u, where u is
-        the influence of z on the action, and f is 1 at the beginning and 0 at the end of training.
-    first_segment: `mean`, or `published`: the sum for the first segment of each episode, as the published code has it.
-    discount, lam: over decisions.
-    entropy: of the high level.
-    """
+    """The two levels of HiPT (Loo, Gong and Meghjani 2023)."""
 
     skills: Annotated[_Int, Field(ge=2, le=64)] = 4
+    """Number of z, of which the high level chooses one."""
     duration_least: _Steps = 20
+    """Least steps of a z; how many is drawn evenly up to `duration_most`."""
     duration_most: _Steps = 39
+    """Most steps of a z."""
     influence: Annotated[Number, Field(ge=1.0)] = 100.0
+    """c_k: the high level is paid the mean over a segment's steps of reward + (1 - f) (c_k - 1) u, where u is the
+    influence of z on the action, and f falls from 1 to 0 over training."""
     first_segment: Literal["mean", "published"] = "mean"
+    """`published`: the first segment of each episode is paid the sum instead, as in the published code."""
     discount: Fraction = 0.99
+    """Of the high level's rewards, by decision."""
     lam: Fraction = 0.98
+    """Lambda of its advantages."""
     entropy: Weight = 0.01
+    """Weight of the entropy of its choices."""
 
     @model_validator(mode="after")
     def _durations_in_order(self) -> HiptConfig:
@@ -108,22 +121,21 @@ class HiptConfig(Schema):
 
 
 class AugmentConfig(Schema):
-    """Start states of self-play beside the environment's own.
-
-    share: of the episodes that begin in a state of earlier play of this training, moved on by random joint actions.
-    random_steps: at most so many of them, drawn evenly from 0.
-    kept: states that are kept to start from, drawn evenly from all play so far.
-    """
+    """Start states of self-play beside the environment's own."""
 
     share: Fraction = 0.5
+    """Of the episodes that begin in a state of earlier play of this training, moved on by random joint actions."""
     random_steps: NonNegative = 20
+    """Most of these actions; how many is drawn evenly from 0."""
     kept: Positive = 4096
+    """States that are kept to start from, drawn evenly from all play so far."""
 
 
 class EgoRun(RunConfig):
     """What runs of all ego agents share."""
 
     ego: EgoConfig = EgoConfig()
+    """Partners, network and PPO."""
 
     @property
     def plays_itself(self) -> bool:
@@ -135,25 +147,30 @@ class HiptRun(EgoRun):
     """A run of HiPT."""
 
     method: Literal["hipt"] = "hipt"
+    """Name of the method."""
     hipt: HiptConfig = HiptConfig()
+    """The two levels."""
 
 
 class FcpRun(EgoRun):
     """A flat ego beside many partners."""
 
-    method: Literal["fcp"] = "fcp"
+    method: Literal["ego_fcp"] = "ego_fcp"
+    """Name of the method."""
 
 
 class BrRun(EgoRun):
     """A best response to one partner."""
 
     method: Literal["br"] = "br"
+    """Name of the method."""
 
 
 class SpRun(EgoRun):
     """Self-play."""
 
     method: Literal["sp"] = "sp"
+    """Name of the method."""
 
     @property
     def plays_itself(self) -> bool:
@@ -165,7 +182,9 @@ class SpAugRun(EgoRun):
     """Self-play from augmented start states."""
 
     method: Literal["sp_aug"] = "sp_aug"
+    """Name of the method."""
     augment: AugmentConfig = AugmentConfig()
+    """Start states."""
 
     @property
     def plays_itself(self) -> bool:

@@ -68,6 +68,53 @@ def make_policy(setup: EgoSetup, spec: EnvSpec, seed: int = 0) -> EgoPolicy:
     return HierarchicalEgoPolicy(setup.sizes, spec, seed, duration_least=least, duration_most=most)
 
 
+class Level(NamedTuple):
+    """What a level's loss is made of: `low` or `high`, its critic, clipping, weights of entropy and critic's error."""
+
+    name: str
+    critic: ValueNet
+    clip: float
+    entropy: float
+    value: float
+
+
+def lose_level(
+    level: Level, batch: dict[str, Tensor], logits: Tensor, taken: Tensor, old_log_prob: Tensor
+) -> dict[str, Tensor]:
+    """The loss of one level and its figures: clipped surrogate, entropy, and the critic's error on its own scale.
+
+    Args:
+        level: which.
+        batch: judged, who, and the level's advantages and returns, with the rows of `taken`.
+        logits: (..., A), of what the level can take.
+        taken, old_log_prob: (...), what it took, and with which log-probability.
+    """
+    if not len(taken):
+        return {"loss": logits.sum()}
+    log_probs = torch.log_softmax(logits, -1)
+    log_prob = log_probs.gather(-1, taken.unsqueeze(-1)).squeeze(-1)
+    entropy = -(log_probs.exp() * log_probs).sum(-1)
+    advantage = batch[f"{level.name}_advantage"]
+    policy = clipped_loss(
+        log_prob,
+        old_log_prob,
+        advantage,
+        entropy,
+        torch.ones_like(advantage),
+        clip=level.clip,
+        entropy_scale=level.entropy,
+    )
+    last = taken.dim() - 1
+    guess = level.critic(batch["judged"].flatten(0, last), batch["who"].flatten(0, last)).squeeze(-1)
+    error = 0.5 * (guess - batch[f"{level.name}_returns"].flatten()).square().mean()
+    with torch.no_grad():
+        change = log_prob - old_log_prob
+        kl = (change.exp() - 1.0 - change).mean()
+    figures = {"policy_loss": policy, "value_loss": error, "entropy": entropy.mean(), "kl": kl}
+    prefix = "" if level.name == "low" else f"{level.name}_"
+    return {"loss": policy + level.value * error} | {prefix + name: value for name, value in figures.items()}
+
+
 class Targets(NamedTuple):
     """What a level learns from its samples: normalised advantages, and returns on the critic's scale."""
 
@@ -210,60 +257,19 @@ class EgoLearner:
         memory = net.remember(encoded, batch["state"][0], batch["is_first"]).outputs
         logits = net.action_logits(memory, batch.get("skill"))
         entropy_scale = linear(config.entropy, config.entropy * config.entropy_end, self.progress, 1.0)
-        ones = torch.ones(())
-        terms = self._lose(
-            "low", batch, logits, batch["actions"], batch["log_prob"], batch["low_advantage"], ones, entropy_scale
-        )
+        low = Level("low", self._critic("low"), config.clip, entropy_scale, config.value_weight)
+        terms = lose_level(low, batch, logits, batch["actions"], batch["log_prob"])
         if self.setup.levels is not None:
-            decided = batch["decides"]
-            chosen = {name: part[decided] for name, part in batch.items() if name != "state"}
-            high = self._lose(
-                "high",
-                chosen,
-                net.skill_logits(memory[decided]),
-                chosen["skill"],
-                chosen["skill_log_prob"],
-                chosen["high_advantage"],
-                ones,
-                self.setup.levels.entropy,
-            )
-            terms |= high | {"loss": terms["loss"] + high["loss"]}
+            chosen = {name: part[batch["decides"]] for name, part in batch.items() if name != "state"}
+            high = Level("high", self._critic("high"), config.clip, self.setup.levels.entropy, config.value_weight)
+            choice = net.skill_logits(memory[batch["decides"]])
+            lost = lose_level(high, chosen, choice, chosen["skill"], chosen["skill_log_prob"])
+            terms |= lost | {"loss": terms["loss"] + lost["loss"]}
         self.optimiser.zero_grad(set_to_none=True)
         terms["loss"].backward()
         norm = nn.utils.clip_grad_norm_(self._learned, config.grad_clip or float("inf"))
         self.optimiser.step()
         return {name: float(value.detach()) for name, value in terms.items()} | {"grad_norm": float(norm)}
-
-    def _lose(
-        self,
-        level: str,
-        batch: dict[str, Tensor],
-        logits: Tensor,
-        taken: Tensor,
-        old_log_prob: Tensor,
-        advantage: Tensor,
-        weight: Tensor,
-        entropy_scale: float,
-    ) -> dict[str, Tensor]:
-        """The loss of one level: clipped surrogate, entropy, and the critic's error on its own scale."""
-        if not len(taken):
-            return {"loss": logits.sum()}
-        log_probs = torch.log_softmax(logits, -1)
-        log_prob = log_probs.gather(-1, taken.unsqueeze(-1)).squeeze(-1)
-        entropy = -(log_probs.exp() * log_probs).sum(-1)
-        policy = clipped_loss(
-            log_prob, old_log_prob, advantage, entropy, weight, clip=self.config.clip, entropy_scale=entropy_scale
-        )
-        critic = self._critic(level)
-        rows = taken.dim()
-        guess = critic(batch["judged"].flatten(0, rows - 1), batch["who"].flatten(0, rows - 1)).squeeze(-1)
-        error = 0.5 * (guess - batch[f"{level}_returns"].flatten()).square().mean()
-        prefix = "" if level == "low" else "high_"
-        with torch.no_grad():
-            change = log_prob - old_log_prob
-            kl = (change.exp() - 1.0 - change).mean()
-        figures = {"policy_loss": policy, "value_loss": error, "entropy": entropy.mean(), "kl": kl}
-        return {"loss": policy + self.config.value_weight * error} | {prefix + k: v for k, v in figures.items()}
 
     # ---- checkpoints ---------------------------------------------------------------------------------------------
 

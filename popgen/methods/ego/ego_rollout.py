@@ -97,6 +97,12 @@ class Company:
     seats: PartnerSeats | None = None
     starts: AugmentedStarts | None = None
 
+    @property
+    def parts(self) -> dict[str, PartnerPool | PartnerSeats | AugmentedStarts]:
+        """Those that there are, each with a state of its own."""
+        parts = {"pool": self.pool, "seats": self.seats, "starts": self.starts}
+        return {name: part for name, part in parts.items() if part is not None}
+
 
 class EgoSampler:
     """Steps N environments with one ego in each; episodes continue from one rollout to the next.
@@ -130,20 +136,13 @@ class EgoSampler:
         self._generator = torch.Generator().manual_seed(seed)
         rows = len(self.env_of_row)
         env.reset(seed=seed)
-        env.set_time(self._first_times())
+        env.set_time(_stagger_ends(env, unroll, 1 if company.seats is None else company.seats.cells))
         self._whole = env.time(env.get_state()) == 0
         self._previous = np.zeros((count, spec.num_players), np.uint8)
         self._first = np.ones(count, bool)
         self._score, self._shaped = np.zeros(count), np.zeros(count)
         self._state = torch.zeros(rows, net.state_size)
         self._skill, self._left = torch.zeros(rows, dtype=torch.int64), torch.zeros(rows, dtype=torch.int64)
-
-    def _first_times(self) -> np.ndarray:
-        """The first ends of episodes are spread over the horizon, so that each rollout shows all ages; the environments
-        of one cell are spread alike."""
-        horizon, cells = self.env.spec.horizon, 1 if self.company.seats is None else self.company.seats.cells
-        phases = horizon // self.unroll if horizon % self.unroll == 0 else 1
-        return (np.arange(self.env.num_envs) // cells % phases) * self.unroll
 
     # ---- one rollout ---------------------------------------------------------------------------------------------
 
@@ -166,13 +165,12 @@ class EgoSampler:
             columns["done"].append(torch.from_numpy(done[self.env_of_row]))
             self._score += result.score
             self._shaped += reward
-            if result.truncated.any():
-                self._note_cuts(columns, t, np.flatnonzero(result.truncated & ~result.terminated))
+            self._note_cuts(columns, t, np.flatnonzero(result.truncated & ~result.terminated))
             self._previous, self._first = actions, done.copy()
             if done.any():
                 episodes += self._end_episodes(np.flatnonzero(done))
         self._judge(columns, self._observe())
-        return self._gather(columns, episodes)
+        return _stack_columns(columns, episodes, self.unroll * self.env.num_envs)
 
     def _observe(self) -> dict[str, np.ndarray]:
         states = self.env.get_state()
@@ -185,17 +183,12 @@ class EgoSampler:
             return np.tile(np.arange(self.env.spec.num_players), self.env.num_envs)
         return 1 - self.company.seats.seat
 
-    def _of_rows(self, values: np.ndarray, seats: np.ndarray) -> Tensor:
-        """(N, P, ...) -> (R, ...), the given seat of each row's environment."""
-        return torch.from_numpy(values[self.env_of_row, seats])
-
     def _judge(self, columns: dict[str, list[Any]], seen: dict[str, np.ndarray]) -> None:
         """What critics look at: the joint features from the row's seat, and who plays."""
-        seats = self._seats
-        features = seen["features"]
-        judged = [self._of_rows(features, seats)]
+        seats, rows, features = self._seats, self.env_of_row, seen["features"]
+        judged = [_pick_rows(features, rows, seats)]
         if self._copies == 2:
-            judged.append(self._of_rows(features, 1 - seats))
+            judged.append(_pick_rows(features, rows, 1 - seats))
         columns["judged"].append(torch.cat(judged, -1))
         who = [F.one_hot(torch.from_numpy(seats), self.env.spec.num_players)]
         if self.company.seats is not None and self.company.pool is not None:
@@ -205,9 +198,9 @@ class EgoSampler:
     def _choose(self, columns: dict[str, list[Any]], seen: dict[str, np.ndarray], *, fresh: bool) -> np.ndarray:
         """The ego's actions (R,), and all that is kept of this choice."""
         self._judge(columns, seen)
-        net, seats = self.net, self._seats
-        obs = self._of_rows(seen[net.sizes.view], seats)
-        own, other = (self._of_rows(self._previous, s).long() for s in (seats, 1 - seats))
+        net, seats, rows = self.net, self._seats, self.env_of_row
+        obs = _pick_rows(seen[net.sizes.view], rows, seats)
+        own, other = (_pick_rows(self._previous, rows, s).long() for s in (seats, 1 - seats))
         first = torch.from_numpy(self._first[self.env_of_row])
         extras = net.make_extras(torch.from_numpy(seats), own, other, first)
         remembered = net.remember(net.encode(obs, extras).unsqueeze(0), self._state, first.unsqueeze(0))
@@ -262,11 +255,10 @@ class EgoSampler:
     def _end_episodes(self, envs: np.ndarray) -> list[EndedEpisode]:
         """Whole episodes among those that ended; all of them begin anew, perhaps with another partner."""
         company, whole = self.company, envs[self._whole[envs]]
-        alone = np.full(self.env.num_envs, -1), np.zeros(self.env.num_envs, np.int64)
-        partner, seat = alone if company.seats is None else (company.seats.partner, company.seats.seat)
-        episodes = [
-            EndedEpisode(int(partner[n]), int(seat[n]), float(self._score[n]), float(self._shaped[n])) for n in whole
-        ]
+        episodes = []
+        for n in whole.tolist():
+            where = (-1, 0) if company.seats is None else (int(company.seats.partner[n]), int(company.seats.seat[n]))
+            episodes.append(EndedEpisode(*where, float(self._score[n]), float(self._shaped[n])))
         if company.seats is not None:
             company.seats.note_returns(whole, self._shaped[whole])
             company.seats.move_on(envs)
@@ -276,23 +268,10 @@ class EgoSampler:
             self._whole[envs[company.starts.begin(envs)]] = False
         return episodes
 
-    def _gather(self, columns: dict[str, list[Any]], episodes: list[EndedEpisode]) -> Rollout:
-        choices = None
-        if self.levels is not None:
-            names = ("skill", "decides", "skill_log_prob", "influence")
-            choices = Choices(*(torch.stack(columns.pop(name)) for name in names))
-        judged, who = columns["judged"][0], columns["who"][0]
-        nowhere = {"cut_at": torch.zeros(0, 2, dtype=torch.int64), "cut_judged": judged[:0], "cut_who": who[:0]}
-        cuts = {name: torch.cat([empty, *columns.pop(name, [])]) for name, empty in nowhere.items()}
-        stacked = {name: torch.stack(column) for name, column in columns.items()}
-        return Rollout(**stacked, **cuts, choices=choices, episodes=episodes, steps=self.unroll * self.env.num_envs)
-
     # ---- checkpoints ---------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Everything to continue from exactly here, except the networks."""
-        company = self.company
-        parts = {"pool": company.pool, "seats": company.seats, "starts": company.starts}
         return {
             "env": self.env.get_state(),
             "env_generator": self.env.generator_state(),
@@ -305,7 +284,7 @@ class EgoSampler:
             "memory": self._state.numpy().copy(),
             "skill": self._skill.numpy().copy(),
             "left": self._left.numpy().copy(),
-            "company": {name: part.state() for name, part in parts.items() if part is not None},
+            "company": {name: part.state() for name, part in self.company.parts.items()},
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -321,7 +300,30 @@ class EgoSampler:
         self._state = torch.from_numpy(np.array(state["memory"], np.float32)).view(self._state.shape)
         self._skill = torch.from_numpy(np.array(state["skill"], np.int64)).view(self._skill.shape)
         self._left = torch.from_numpy(np.array(state["left"], np.int64)).view(self._left.shape)
-        company = self.company
-        for name, part in {"pool": company.pool, "seats": company.seats, "starts": company.starts}.items():
-            if part is not None:
-                part.load_state(state["company"][name])
+        for name, part in self.company.parts.items():
+            part.load_state(state["company"][name])
+
+
+def _stagger_ends(env: BatchedEnv, unroll: int, cells: int) -> np.ndarray:
+    """(N,) first time steps: the first ends of episodes are spread over the horizon, so that each rollout shows all
+    ages; the environments of one cell are spread alike."""
+    horizon = env.spec.horizon
+    phases = horizon // unroll if horizon % unroll == 0 else 1
+    return (np.arange(env.num_envs) // cells % phases) * unroll
+
+
+def _pick_rows(values: np.ndarray, envs: np.ndarray, seats: np.ndarray) -> Tensor:
+    """(N, P, ...) -> (R, ...), the given seat of each row's environment."""
+    return torch.from_numpy(values[envs, seats])
+
+
+def _stack_columns(columns: dict[str, list[Any]], episodes: list[EndedEpisode], steps: int) -> Rollout:
+    choices = None
+    if "skill" in columns:
+        names = ("skill", "decides", "skill_log_prob", "influence")
+        choices = Choices(*(torch.stack(columns.pop(name)) for name in names))
+    judged, who = columns["judged"][0], columns["who"][0]
+    nowhere = {"cut_at": torch.zeros(0, 2, dtype=torch.int64), "cut_judged": judged[:0], "cut_who": who[:0]}
+    cuts = {name: torch.cat([empty, *columns.pop(name, [])]) for name, empty in nowhere.items()}
+    stacked = {name: torch.stack(column) for name, column in columns.items()}
+    return Rollout(**stacked, **cuts, choices=choices, episodes=episodes, steps=steps)

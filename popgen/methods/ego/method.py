@@ -27,8 +27,8 @@ HIPT = Method(
 )
 
 FCP = Method(
-    name="fcp",
-    title="FCP",
+    name="ego_fcp",
+    title="FCP ego",
     summary="A recurrent ego of one level beside a population.",
     colour="#332288",
     marker="X",

@@ -1,30 +1,45 @@
-"""Where a partner comes from: what an ego's record says of those it was trained with."""
+"""Where partners come from: what an ego's record says of those it was trained with."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
-class Partner:
-    """One member of a population, as `member.json` of an ego lists it under `trained_with`.
+class PartnerSource:
+    """A population whose members an ego is trained with.
 
     Attributes:
-        name: short, unique among an ego's partners: `xpm_sim_1/3`.
-        method: that generated its population.
-        population_seed: of the run that generated it.
+        method: that generated it.
+        seed: of the run that generated it.
         config_digest: of that run's configuration.
-        member: from 1.
-        seed: the member's own.
-        policy_sha256: of the weights that it acted with.
-        snapshot: of its training, "" for the finished member.
+        members: those that play, from 1.
+        policy_sha256: of the weights that they act with, in this order.
     """
 
-    name: str
     method: str
-    population_seed: int
-    config_digest: str
-    member: int
     seed: int
-    policy_sha256: str
-    snapshot: str = ""
+    config_digest: str
+    members: tuple[int, ...]
+    policy_sha256: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """As `member.json` of an ego lists it under `trained_with`; hold-out evaluation reads it."""
+        return {
+            "method": self.method,
+            "seed": self.seed,
+            "config_digest": self.config_digest,
+            "members": list(self.members),
+            "policy_sha256": list(self.policy_sha256),
+        }
+
+
+def name_partners(sources: Sequence[PartnerSource]) -> list[str]:
+    """A short name for each partner, in the order of the sources and their members; all are different."""
+    names: list[str] = []
+    for number, source in enumerate(sources, 1):
+        own = [f"{source.method}_{source.seed}/{member}" for member in source.members]
+        names += [f"{number}.{name}" for name in own] if set(own) & set(names) else own
+    return names

@@ -19,7 +19,7 @@ import numpy as np
 from popgen.methods.ego.config import EgoRun
 from popgen.methods.ego.ego_policy import EgoPolicy
 from popgen.methods.ego.ego_rollout import EndedEpisode
-from popgen.methods.ego.partner_source import Partner
+from popgen.methods.ego.partner_source import PartnerSource, name_partners
 from popgen.methods.ego.workers import Iterations, Workers
 from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
 from popgen.nets.weights import Weights, prefixed
@@ -69,18 +69,24 @@ class EgoTraining:
     begins_workers = False
 
     def __init__(
-        self, config: EgoRun, policy: EgoPolicy, unit: str, attempt: str, workers: Workers, partners: Sequence[Partner]
+        self,
+        config: EgoRun,
+        policy: EgoPolicy,
+        unit: str,
+        attempt: str,
+        workers: Workers,
+        sources: Sequence[PartnerSource],
     ) -> None:
         self.run, self.config, self.policy, self.unit = config, config.ego, policy, unit
-        self.attempt, self.workers, self.partners = attempt.rpartition(".")[2], workers, list(partners)
-        self.names = [partner.name for partner in self.partners]
+        self.attempt, self.workers, self.sources = attempt.rpartition(".")[2], workers, list(sources)
+        self.names = name_partners(self.sources)
         self.kind = Kind.SP if config.plays_itself else Kind.XP
         self.member, self.seed, self.progress = 0, 0, EgoProgress()
 
     def train(self) -> Loop:
         """Iterations until the steps are done."""
         config, now = self.config, self.progress
-        beside = "itself" if not self.partners else f"{len(self.partners)} partners"
+        beside = f"{len(self.names)} partner{'s' * (len(self.names) > 1)}" if self.names else "itself"
         yield Phase(f"ego {self.member} beside {beside}", config.steps)
         if now.rounds:
             yield Progress(self.member, now.steps, note=f"continuing after {now.steps:,} steps of ego {self.member}")
@@ -122,7 +128,7 @@ class EgoTraining:
         now, scores = self.progress, self.progress.scores
         self.policy.load(self.workers.acting().result())
         extra = {
-            "trained_with": [asdict(partner) for partner in self.partners],
+            "trained_with": [source.as_dict() for source in self.sources],
             "scores_in_training": scores,
             "seconds": round(now.seconds, 1),
         }
