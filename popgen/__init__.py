@@ -7,6 +7,7 @@ from typing import Any
 __version__ = "0.1.0"
 
 _LAZY = {
+    "evaluate_population": "popgen.evaluation.crossplay",
     "load_population": "popgen.population",
     "make_env": "popgen.envs",
     "recipe": "popgen.methods.registry",

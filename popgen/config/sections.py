@@ -26,6 +26,8 @@ class EnvConfig(Schema):
     def _seed_is_the_runs(self) -> EnvConfig:
         if "seed" in self.params:
             raise UserError("params.seed", "environments take the run's seed", "set run.seed")
+        if "num_envs" in self.params:
+            raise UserError("params.num_envs", "is no parameter of an environment", "leave it out")
         return self
 
 

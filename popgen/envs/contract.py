@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -31,8 +31,8 @@ class ViewSpec:
     dtype: str
     binary: bool
     scale: float = 1.0
-    swap: tuple[int, ...] | None = None
-    maxima: tuple[float, ...] | None = None
+    swap: tuple[int, ...] | None = field(default=None, repr=False)
+    maxima: tuple[float, ...] | None = field(default=None, repr=False)
     own: tuple[tuple[int, ...], ...] = ()
 
 
@@ -77,11 +77,28 @@ class EnvSpec:
 class BatchedEnv(ABC):
     """B copies of one environment stepped together by one seeded generator.
 
-    Nothing resets by itself: after a step with `done`, call `reset(indices=...)` for those rows.
+    Nothing resets by itself: after a step with `done`, call `reset(indices=...)` for those rows. An environment can be
+    used in a `with` statement, which closes it.
     """
 
     spec: EnvSpec
     num_envs: int
+
+    def __repr__(self) -> str:
+        views = ", ".join(f"{name} {view.shape} {view.dtype}" for name, view in self.spec.views.items())
+        copies = f"{self.num_envs} environment{'s' if self.num_envs > 1 else ''}"
+        return (
+            f"<{type(self).__name__} {self.spec.name}: {copies}, {self.spec.horizon} steps an episode, views {views}>"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:  # noqa: B027 (nothing to do is the rule)
+        """Give back what the environment holds; those of popgen hold memory alone."""
 
     @abstractmethod
     def reset(self, seed: int | None = None, indices: np.ndarray | None = None) -> None:

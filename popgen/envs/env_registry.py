@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from numbers import Integral
 from typing import Any
 
 from popgen.envs.contract import BatchedEnv
@@ -101,8 +102,14 @@ def env_names() -> list[str]:
     return names
 
 
-def make_env(name: str, num_envs: int = 1, /, *, seed: int = 0, **params: Any) -> BatchedEnv:
+def make_env(name: str, /, num_envs: int = 1, *, seed: int = 0, **params: Any) -> BatchedEnv:
     """Build B environments of a registered family.
+
+    Args:
+        name: `family/variant`, see `env_names`; for Overcooked also a layout of overcooked_ai or a file's path.
+        num_envs: B.
+        seed: of the environment's generator.
+        params: of the family, such as `horizon`.
 
     Raises:
         UserError: unknown family, variant or parameter, a batch size below 1, or a package that cannot be imported.
@@ -113,12 +120,12 @@ def make_env(name: str, num_envs: int = 1, /, *, seed: int = 0, **params: Any) -
     family = _load_family(kind)
     if variant not in family.variants and not family.is_open:  # before the parameters, which may be another one's
         raise UserError("env.name", f"unknown environment {name!r}", f"choose {' or '.join(family.list_names())}")
-    if num_envs < 1:
-        raise UserError("num_envs", f"must be at least 1, got {num_envs}")
+    if isinstance(num_envs, bool) or not isinstance(num_envs, Integral) or num_envs < 1:
+        raise UserError("num_envs", f"must be a whole number of at least 1, got {num_envs!r}")
     if reserved := sorted(_GIVEN & params.keys()):
         raise UserError(f"env.params.{reserved[0]}", "is no parameter of an environment", "leave it out")
     try:
-        return family.load_environment()(variant, num_envs, seed=seed, **params)
+        return family.load_environment()(variant, int(num_envs), seed=seed, **params)
     except TypeError as error:
         if "unexpected keyword" not in str(error):
             raise

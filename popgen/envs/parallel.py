@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,9 +31,11 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
         view: `features`, or another view of the environment such as `lossless`.
         reward: `environment`, the environment's own joint reward, or `events`, the weighted events of both players.
         render_mode: `rgb_array`, `ansi` or None.
+        dtype: of observations, such as `float32` for networks that take no bytes (RLlib's default one); None for the
+            view's own. Values stay the same.
 
     Raises:
-        UserError: more than one copy, or an unknown view, reward or render mode.
+        UserError: more than one copy, an unknown view, reward or render mode, or a dtype that cannot hold the values.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -43,7 +46,13 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
     }
 
     def __init__(
-        self, env: BatchedEnv, *, view: str = "features", reward: str = "environment", render_mode: str | None = None
+        self,
+        env: BatchedEnv,
+        *,
+        view: str = "features",
+        reward: str = "environment",
+        render_mode: str | None = None,
+        dtype: str | None = None,
     ) -> None:
         if env.num_envs != 1:
             raise UserError("num_envs", f"a ParallelEnv shows one environment, got {env.num_envs}", "use num_envs=1")
@@ -56,6 +65,9 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
         self.possible_agents = [f"player_{player}" for player in range(env.spec.num_players)]
         self.agents: list[str] = []
         seen = env.spec.views[view]
+        if dtype is not None:
+            seen = replace(seen, dtype=_check_dtype(dtype, seen))
+        self.dtype = np.dtype(seen.dtype)
         self.observation_spaces = {agent: _make_space(seen, seen.shape) for agent in self.possible_agents}
         self.action_spaces = {agent: spaces.Discrete(env.spec.num_actions) for agent in self.possible_agents}
         self.state_space = _make_space(seen, (env.spec.num_players, *seen.shape))
@@ -112,7 +124,7 @@ class PopgenParallelEnv(ParallelEnv[str, np.ndarray, int]):
 
     def state(self) -> np.ndarray:
         """The joint observation (P, *view.shape)."""
-        return self.env.observe(self.view)[0]
+        return self.env.observe(self.view)[0].astype(self.dtype, copy=False)
 
     def render(self) -> np.ndarray | str | None:
         """A picture (H, W, 3) uint8 or text, as `render_mode` says; None without a render mode."""
@@ -142,15 +154,17 @@ def parallel_env(
     view: str = "features",
     reward: str = "environment",
     render_mode: str | None = None,
+    dtype: str | None = None,
     seed: int = 0,
     **params: Any,
 ) -> PopgenParallelEnv:
     """A registered environment as a ParallelEnv; `params` go to the environment (see `make_env`).
 
     Raises:
-        UserError: unknown environment, parameter, view, reward or render mode.
+        UserError: unknown environment, parameter, view, reward, render mode or dtype.
     """
-    return PopgenParallelEnv(make_env(name, 1, seed=seed, **params), view=view, reward=reward, render_mode=render_mode)
+    env = make_env(name, 1, seed=seed, **params)
+    return PopgenParallelEnv(env, view=view, reward=reward, render_mode=render_mode, dtype=dtype)
 
 
 def _check_action(agent: str, action: Any) -> int:
@@ -163,6 +177,22 @@ def _check_action(agent: str, action: Any) -> int:
         return operator.index(action.item() if isinstance(action, np.ndarray) and action.size == 1 else action)
     except TypeError:
         raise ValueError(f"actions: {agent} plays {action!r}, which is no whole number") from None
+
+
+def _check_dtype(dtype: str, view: ViewSpec) -> str:
+    """The dtype's name, if it holds the view's values as they are.
+
+    Raises:
+        UserError: it does not.
+    """
+    try:
+        wanted = np.dtype(dtype)
+    except TypeError:
+        raise UserError("dtype", f"{dtype!r} is unknown", "choose one such as float32") from None
+    # Half the bits of a view of floats are a choice; counts must stay whole, and signs must stay.
+    if wanted.kind not in "iuf" or not np.can_cast(view.dtype, wanted, "same_kind"):
+        raise UserError("dtype", f"{wanted.name} does not hold {view.dtype}", "choose one such as float32")
+    return wanted.name
 
 
 def _make_space(view: ViewSpec, shape: tuple[int, ...]) -> spaces.Box:

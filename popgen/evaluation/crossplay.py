@@ -66,7 +66,7 @@ class Obstruction:
     p_value: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CrossPlayResult:
     """All pairings of M members and the figures drawn from them.
 
@@ -95,6 +95,10 @@ class CrossPlayResult:
     pairings: dict[tuple[str, str], Pairing]
     mixed: tuple[MixedPlay, ...] = ()
     mixed_episodes: int = 0
+
+    def __repr__(self) -> str:
+        members = f"{len(self.members)} members of {self.method} in {self.environment.name}"
+        return f"<SP/XP of {members}: SP {self.sp}, XP {self.xp}, {self.episodes} episodes a pair>"
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -181,8 +185,8 @@ class CrossPlayResult:
 
 def evaluate_population(
     population: Population,
-    episodes: int,
-    seed: int,
+    episodes: int = 20,
+    seed: int = 0,
     members: Sequence[int] | None = None,
     *,
     max_envs: int = 1024,

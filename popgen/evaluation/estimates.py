@@ -36,6 +36,11 @@ class Estimate:
         values = {"mean": self.mean, "standard_error": self.error}
         return {name: float(value) if math.isfinite(value) else None for name, value in values.items()}
 
+    def __str__(self) -> str:
+        if not math.isfinite(self.mean):
+            return "unknown"
+        return f"{self.mean:.2f} ± {self.error:.2f}" if math.isfinite(self.error) else f"{self.mean:.2f}"
+
     def below(self, other: Estimate) -> bool:
         """Lower than `other` by more than two standard errors of the difference; never where these are unknown."""
         return self.mean < other.mean - 2 * math.hypot(self.error, other.error)

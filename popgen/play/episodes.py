@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from popgen.types import RANDOM_MEMBER, Kind
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def _no_events() -> np.ndarray:
@@ -38,7 +42,7 @@ class Episode:
         return second if first == member else first
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Episodes:
     """N full episodes, one per row. Score, reward and shaped return are different figures.
 
@@ -61,6 +65,25 @@ class Episodes:
     length: np.ndarray
     terminated: np.ndarray
     steps: int
+
+    def __repr__(self) -> str:
+        score = (
+            f"score {self.score.mean():.2f} (from {self.score.min():g} to {self.score.max():g})" if len(self) else ""
+        )
+        return f"<{len(self)} episodes: {score}, {self.steps:,} environment steps>"
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    def to_frame(self) -> pd.DataFrame:
+        """An episode a row: seats, score, reward, length, whether the task itself ended, shaped return of each seat."""
+        import pandas as pd  # samplers, which import this module, do without
+
+        columns: dict[str, np.ndarray] = {}
+        for seat in range(self.seats.shape[1]):
+            columns |= {f"seat_{seat}": self.seats[:, seat], f"shaped_{seat}": self.shaped[:, seat]}
+        columns |= {name: getattr(self, name) for name in ("score", "reward", "length", "terminated")}
+        return pd.DataFrame(columns)
 
     @staticmethod
     def concat(parts: Sequence[Episodes]) -> Episodes:

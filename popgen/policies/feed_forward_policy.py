@@ -83,6 +83,9 @@ class FeedForwardPolicy:
             self.net = FeedForwardNet(view, num_actions, num_players, self.sizes)
         self._generator = torch.Generator().manual_seed(0)
 
+    def __repr__(self) -> str:
+        return f"<FeedForwardPolicy on {self.view!r}, {sum(p.numel() for p in self.net.parameters()):,} weights>"
+
     def reset(self, batch: int, seed: int) -> None:
         """Restart the generator; there is no memory."""
         self._generator.manual_seed(seed)

@@ -13,7 +13,9 @@ import numpy as np
 from popgen.envs import BatchedEnv, EnvSpec, make_env
 from popgen.errors import UserError
 from popgen.jsonable import jsonable
+from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
+from popgen.play.rollout import play_teams
 from popgen.policies.policy_registry import build_policy
 from popgen.population import files
 from popgen.population.manifest import (
@@ -27,6 +29,9 @@ from popgen.population.manifest import (
     cooking_of,
     folder_name,
 )
+
+SIMPLE = ("random", "idle")
+"""Players of every environment that are no members."""
 
 MANIFEST, MEMBER, POLICY, TRAINING = "manifest.json", "member.json", "policy.safetensors", "training.safetensors"
 
@@ -170,6 +175,11 @@ class Population:
     def __init__(self, path: Path, manifest: Manifest, members: tuple[MemberInfo, ...], spec: EnvSpec) -> None:
         self.path, self.manifest, self.members, self.spec = path, manifest, members, spec
 
+    def __repr__(self) -> str:
+        members = f"{len(self)} member{'' if len(self) == 1 else 's'}"
+        about = f"by {self.manifest.method} in {self.env_info.name}, seed {self.manifest.seed}"
+        return f"<Population of {members} {about}: {str(self.path)!r}>"
+
     @property
     def env_info(self) -> EnvironmentInfo:
         """The environment as the manifest names it."""
@@ -214,6 +224,37 @@ class Population:
     def make_env(self, num_envs: int = 1, seed: int = 0) -> BatchedEnv:
         """The environment the members were trained in."""
         return make_env(self.env_info.name, num_envs, seed=seed, **self.env_info.params)
+
+    def play(self, *players: int | str, episodes: int = 20, seed: int = 0) -> Episodes:
+        """Full episodes in the members' environment.
+
+        Args:
+            players: who sits in each seat: members, `"random"` or `"idle"`; one member alone plays with itself.
+            episodes: how many, in one batch.
+            seed: same arguments, same episodes.
+
+        Returns:
+            Scores, rewards and events, an episode each row (`popgen.play.episodes.Episodes`).
+
+        Raises:
+            IndexError: no such member.
+            ValueError: players for another number of seats, an unknown player, or less than one episode.
+        """
+        seats = self.spec.num_players
+        seated = players * seats if len(players) == 1 else players
+        if len(seated) != seats:
+            raise ValueError(f"players: {len(players)} given for {seats} seats")
+        different = list(dict.fromkeys(seated))
+        policies = [self._find_player(player) for player in different]
+        match = tuple(different.index(player) for player in seated)
+        return play_teams(lambda count, _: self.make_env(count), policies, [match], episodes, seed=seed)
+
+    def _find_player(self, player: int | str) -> Policy:
+        if isinstance(player, str):
+            if player not in SIMPLE:
+                raise ValueError(f"player must be a member, {' or '.join(map(repr, SIMPLE))}, got {player!r}")
+            return build_policy(player, {}, {}, self.spec)
+        return self[player]
 
 
 def load_population(path: str | Path) -> Population:

@@ -60,6 +60,9 @@ class WorldModelPolicy:
         self._generator = torch.Generator()
         self._latent: Latent | None = None
 
+    def __repr__(self) -> str:
+        return f"<WorldModelPolicy on {self.view!r}, {sum(p.numel() for p in self._parts.parameters()):,} weights>"
+
     def reset(self, batch: int, seed: int) -> None:
         """B fresh episodes; see `Policy`."""
         self._generator.manual_seed(seed)
@@ -68,7 +71,9 @@ class WorldModelPolicy:
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """(B, P) uint8 actions; see `Policy`."""
         if self._latent is None or len(is_first) != len(self._latent.h):
-            raise RuntimeError(f"reset(batch={len(is_first)}, seed) before act on {len(is_first)} rows")
+            before = "nothing yet" if self._latent is None else f"{len(self._latent.h)} rows"
+            problem = f"act on {len(is_first)} rows, but reset for {before}"
+            raise RuntimeError(f"{problem}: call reset(batch={len(is_first)}, seed=...) first")
         with torch.no_grad():
             self._latent = self.filter.filter(
                 self._latent,
