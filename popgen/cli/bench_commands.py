@@ -19,7 +19,7 @@ C = TypeVar("C", bound="RunConfig")
 
 
 def add(commands: Any) -> None:
-    """`bench env`, `bench mappo` and `bench scale`."""
+    """`bench env`, `bench mappo`, `bench world-model` and `bench scale`."""
     bench = commands.add_parser("bench", help="measure speed", description="Measure speed.")
     kinds = bench.add_subparsers(title="what to measure", metavar="WHAT", required=True, parser_class=Parser)
     env = add_command(
@@ -43,6 +43,17 @@ def add(commands: Any) -> None:
     )
     mappo.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
     mappo.add_argument("--seconds", type=positive, default=20.0, help="time of the measurement (%(default)s)")
+    learners = add_command(
+        kinds,
+        "world-model",
+        bench_world_model,
+        "XPM-WM's two learners: milliseconds by part, and how near they come to this machine's matrix products",
+        "Keys of --json: sizes (recipe -> world_model and agent, each milliseconds, parts, flops, share_of_peak; "
+        "precision), peaks (float32, bfloat16: operations a second), threads.",
+    )
+    learners.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
+    learners.add_argument("--scales", default="laptop,paper", metavar="NAME,...", help="recipes (%(default)s)")
+    learners.add_argument("--seconds", type=positive, default=10.0, help="time per measurement (%(default)s)")
     scale = add_command(
         kinds,
         "scale",
@@ -86,6 +97,22 @@ def bench_mappo(args: argparse.Namespace) -> int:
     return OK
 
 
+def bench_world_model(args: argparse.Namespace) -> int:
+    """Milliseconds of an update."""
+    from popgen.methods.xpm_wm.config import XpmWmRun
+
+    words = [*args.overrides, "method=xpm_wm"]
+    configs = {name: _check_run(XpmWmRun, [*words, f"scale={name}"]) for name in args.scales.split(",")}
+    from popgen.pipelines.bench_world_model import bench_world_model as measure
+
+    result = measure(configs, seconds=args.seconds)
+    if args.json:
+        print_json(result)
+    else:
+        _print_learners(result)
+    return OK
+
+
 def bench_scale(args: argparse.Namespace) -> int:
     """Environment steps a second with several samplers."""
     from popgen.methods.xpm_wm.config import XpmWmRun
@@ -100,6 +127,22 @@ def bench_scale(args: argparse.Namespace) -> int:
     else:
         _print_scale(result)
     return OK
+
+
+def _print_learners(result: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    parts = list(next(iter(result["sizes"].values()))["agent"]["parts"])
+    table = Table("size", "learner", "ms", *parts, "GFLOP/s", "of peak", title="one update, milliseconds by part")
+    for size, learners in result["sizes"].items():
+        for learner in ("world_model", "agent"):
+            row = learners[learner]
+            spent = (f"{row['parts'][part]:.1f}" for part in parts)
+            rate = f"{row['flops'] / 1e9:.1f}", f"{row['share_of_peak']:.0%} ({learners['precision'][learner]})"
+            table.add_row(size, learner.replace("_", " "), f"{row['milliseconds']:.1f}", *spent, *rate)
+    print_table(table)
+    peaks = ", ".join(f"{name} {value / 1e9:.0f} GFLOP/s" for name, value in result["peaks"].items())
+    print(f"peak of matrix products here, {result['threads']} threads: {peaks}")
 
 
 def _check_run(schema: type[C], overrides: list[str]) -> C:

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 def bound_threads(count: int) -> None:
     """Before torch is imported: its threads wait for each other actively, which on busy cores costs many times more
-    than one thread alone takes for the small networks of an acting policy."""
+    than one thread alone takes for the small networks of an acting policy. Where there are several, they are to sleep
+    while they wait; the workers of a local Ray inherit both."""
     os.environ.setdefault("OMP_NUM_THREADS", str(count))
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def before_ray(threads: int, local: bool) -> None:

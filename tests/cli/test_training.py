@@ -15,7 +15,7 @@ AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN")
 @pytest.fixture(autouse=True)
 def without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     """An environment and a process that know nothing of Ray; both are put back."""
-    for name in (*AUTH, "OMP_NUM_THREADS", "RAY_USAGE_STATS_ENABLED"):
+    for name in (*AUTH, "OMP_NUM_THREADS", "OMP_WAIT_POLICY", "RAY_USAGE_STATS_ENABLED"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setattr(sys, "modules", {k: v for k, v in sys.modules.items() if k != "ray"})
@@ -24,6 +24,7 @@ def without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 def settled(local: bool) -> list[str | None]:
     before_ray(3, local)
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0" and os.environ["OMP_NUM_THREADS"] == "3"
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
     return [os.environ.get(name) for name in AUTH]
 
 
