@@ -26,7 +26,7 @@ from popgen.types import RANDOM_MEMBER, Kind
 
 PARTS: dict[str, tuple[str, ...]] = {
     "products": ("mm", "addmm", "bmm", "baddbmm", "linear", "convolution", "mkldnn"),
-    "optimiser": ("adam", "lerp", "addcdiv", "addcmul", "sqrt", "foreach", "linalg_vector_norm"),
+    "optimiser": ("fused_adam", "adam", "lerp", "addcdiv", "addcmul", "sqrt", "foreach", "linalg_vector_norm"),
     "casts and copies": ("copy", "clone", "_to_copy", "contiguous"),
     "joining": ("cat", "stack"),
 }

@@ -19,7 +19,8 @@ from popgen.actors.tracker_actor import RemoteTracker
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
-from popgen.evaluation.crossplay import evaluate_population
+from popgen.evaluation.crossplay import CrossPlayResult, evaluate_population
+from popgen.evaluation.weak_members import WeakMember, find_weak_members
 from popgen.methods.registry import METHODS
 from popgen.methods.training import Training
 from popgen.methods.transport import InlineTransport, Transport
@@ -207,6 +208,9 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     figures = {"sp": result.sp.mean, "xp": result.xp.mean}
     recorder.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
     evaluation = to_dict(result)
+    weak = [one.describe(spec.score_name) for one in list_weak_members(config, recorder, result)]
+    for line in weak:
+        recorder.events.write("weak", level="WARNING", text=line)
     return {
         "run_id": recorder.run_id,
         "run_dir": str(recorder.dir),
@@ -216,6 +220,14 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         "matrix": evaluation["matrix"],
         "evaluation": evaluation,
         "warnings": list_warnings(evaluation),
+        "weak_members": weak,
         "files": {suffix: str(file) for suffix, file in files.items()},
         "seconds": round(time.time() - recorder.began, 1),
     }
+
+
+def list_weak_members(config: RunConfig, recorder: RunRecorder, result: CrossPlayResult) -> list[WeakMember]:
+    """Members that do not play, by their methods' targets where there are any, and by each other."""
+    infos = load_population(recorder.dir / "population").members
+    targets = {info.id: float(info.extra["target"]) for info in infos if "target" in info.extra}
+    return find_weak_members(result, targets, config.evaluation.weak_share)

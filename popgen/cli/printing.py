@@ -10,7 +10,7 @@ from typing import Any
 
 from popgen.jsonable import jsonable
 
-OK, ERROR, INTERRUPTED = 0, 2, 130
+OK, ERROR, WEAK, INTERRUPTED = 0, 2, 3, 130
 
 
 def short(text: str, length: int = 100) -> str:

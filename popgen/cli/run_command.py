@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, to_yaml
-from popgen.cli.printing import OK, print_json, print_table
+from popgen.cli.printing import OK, WEAK, print_json, print_table
 from popgen.cli.training import before_ray, tell_notes
 
 if TYPE_CHECKING:
@@ -26,10 +26,11 @@ def add(commands: Any) -> None:
         "Overrides are Hydra's: a group as in env=overcooked/cramped_room, method=xpm_wm, scale=laptop, "
         "cluster=gpu_node or tracking=off, a field as in population.size=3 or agent.lambda_xp=0.1; seed=1 stands for "
         "run.seed=1. `popgen config METHOD` lists the fields. The same run.id goes on where an interrupted run was. "
-        "Exit codes: 0, 2 for an error told in one line, 130 when interrupted. Keys of --json: run_id, run_dir, "
+        "Exit codes: 0, 2 for an error told in one line, 3 for a population with a member that does not play, which "
+        "the last lines name (evaluation.weak_share), 130 when interrupted. Keys of --json: run_id, run_dir, "
         "population (paths), members (how many), matrix (mean and standard_error, row = seat 0, column = seat 1), "
-        "ledger (environment steps by member and kind), evaluation (as `evaluate --json`), files (the report's), "
-        "seconds; with --dry-run the whole configuration.",
+        "ledger (environment steps by member and kind), evaluation (as `evaluate --json`), weak_members (a line for "
+        "each that does not play), files (the report's), seconds; with --dry-run the whole configuration.",
     )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
     parser.add_argument(
@@ -77,7 +78,7 @@ def execute(config: RunConfig, args: argparse.Namespace) -> int:
         print_json(result)
     else:
         _print_run(result)
-    return OK
+    return WEAK if result["weak_members"] else OK
 
 
 def _print_config(values: dict[str, Any], as_json: bool) -> int:
@@ -98,3 +99,5 @@ def _print_run(result: Mapping[str, Any]) -> None:
         print(f"environment steps, {'all' if who == 'total' else f'member {who}'}: {kinds}")
     print(f"time: {result['seconds'] / 60:.1f} minutes")
     print(f"population: {result['population']}   ledger, checkpoints and reports: {result['run_dir']}")
+    for line in result["weak_members"]:
+        print(line)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StrictBool, model_validator
 
-from popgen.config.schema import Batch, Positive, Schema, Text, Weight, _Int
+from popgen.config.schema import Batch, Fraction, Positive, Schema, Text, Weight, _Int
 from popgen.errors import UserError
 
 Place = Annotated[str, AfterValidator(os.path.expanduser)]
@@ -47,6 +47,8 @@ class EvaluationConfig(Schema):
 
     episodes: Batch = 20
     """Episodes behind each figure of the SP/XP matrix, for each pair of members in each seating."""
+    weak_share: Fraction = 0.25
+    """A member does not play if its self-play is below this share of its target or of the other members' median."""
 
 
 class ClusterConfig(Schema):

@@ -347,6 +347,21 @@ class DiscoveryConfig(Schema):
     which they are for are made for their own sake."""
 
 
+class WatchConfig(Schema):
+    """When a run says that training goes wrong, and what to do; it changes nothing else."""
+
+    imagined_factor: Weight = 4.0
+    """Imagined reward a step may exceed real self-play's so many times; 0: it is not watched."""
+    first_rounds: Positive = 50
+    """Rounds of member 1 in a row in which it exceeds that before a line is written."""
+    later_rounds: Positive = 6
+    """The same for rounds of later members."""
+    precision_share: Fraction = 0.7
+    """Share of the best precision of predicted events below which precision has fallen; 0: it is not watched."""
+    precision_reports: Positive = 2
+    """Reports in a row with such a precision before a line is written."""
+
+
 class XpmWmRun(RunConfig):
     """A run of XPM-WM."""
 
@@ -364,6 +379,8 @@ class XpmWmRun(RunConfig):
     """Later members, mostly in imagination."""
     discovery: DiscoveryConfig = DiscoveryConfig()
     """What finds rare rewards and distrusts made-up ones."""
+    watch: WatchConfig = WatchConfig()
+    """When a run says that training goes wrong."""
 
     @model_validator(mode="after")
     def _check_windows(self) -> XpmWmRun:

@@ -16,6 +16,7 @@ from popgen.methods.training import Pending, State
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.play_tally import Tally
 from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.training_watch import Watch
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerStrength
@@ -90,6 +91,7 @@ class FirstMemberProgress:
         best: the policy of the best window.
         published, played: the weights learned last, and those that play.
         model, starts, recent_starts: of the world model's last update.
+        watch: signs of trouble so far.
     """
 
     window: int
@@ -111,6 +113,7 @@ class FirstMemberProgress:
     model: Pending[Weights] | None = None
     starts: Pending[Starts] | None = None
     recent_starts: Pending[Starts] | None = None
+    watch: Watch = field(default_factory=Watch)
 
     @property
     def latest(self) -> MemberWeights:
@@ -151,6 +154,7 @@ class FirstMemberProgress:
             "model": self.model,
             "starts": self.starts,
             "recent_starts": self.recent_starts,
+            "watch": self.watch.to_state(),
         }
 
     @staticmethod
@@ -172,6 +176,7 @@ class FirstMemberProgress:
             model=put(state["model"]),
             starts=put(Starts(**state["starts"])),
             recent_starts=None if state["recent_starts"] is None else put(Starts(**state["recent_starts"])),
+            watch=Watch.from_state(state["watch"]),
         )
         progress.add_scores(map(float, state["recent"]), map(float, state["shaped"]))
         return progress
@@ -188,6 +193,7 @@ class LaterMemberProgress:
         plays: self-play has begun (`agent.entropy_after` of the target).
         best: the policy of the best round.
         figures: of the last round.
+        watch: signs of trouble so far.
     """
 
     strength: PartnerStrength
@@ -197,6 +203,7 @@ class LaterMemberProgress:
     best: Candidate | None = None
     figures: dict[str, float] = field(default_factory=dict)
     since_best: int = 0
+    watch: Watch = field(default_factory=Watch)
 
     @property
     def best_shown(self) -> dict[str, float]:
@@ -210,6 +217,7 @@ class LaterMemberProgress:
             "rounds": self.rounds,
             "plays": self.plays,
             "since_best": self.since_best,
+            "watch": self.watch.to_state(),
             "best": self.best.to_state(),
             "strength": self.strength.state(),
         }
@@ -219,8 +227,9 @@ class LaterMemberProgress:
         """From `to_state()`, as it was read."""
         strength.load_state(state["strength"])
         best = Candidate.from_state(state["best"], put)
-        rounds, plays = int(state["rounds"]), bool(state["plays"])
-        return LaterMemberProgress(strength, steps, rounds, plays, best, since_best=int(state["since_best"]))
+        rounds, plays, since_best = int(state["rounds"]), bool(state["plays"]), int(state["since_best"])
+        watch = Watch.from_state(state["watch"])
+        return LaterMemberProgress(strength, steps, rounds, plays, best, since_best=since_best, watch=watch)
 
 
 # ---- what real play has shown ----------------------------------------------------------------------------------------

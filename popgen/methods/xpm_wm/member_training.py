@@ -86,7 +86,9 @@ class XpmWmTraining:
         yield Progress(self.member, steps, {"final_sp": candidate.sp, "final_xp": candidate.xp, **report})
         policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
         policy.load(acting)
+        phase = self.config.phase1 if self.member == FIRST else self.config.phase2
         extra = {"sp": candidate.sp, "xp": candidate.xp, "seconds": round(seconds, 1), "world_model": report}
+        extra["target"] = phase.target_score
         note = (
             f"member {self.member}: SP {candidate.sp:.2f}, XP {candidate.xp:.2f} {self.spec.score_name} in training, "
             f"{steps:,} environment steps, {seconds / 60:.1f} min"

@@ -109,6 +109,7 @@ SMOKE = Recipe(
         "phase2.max_rounds": 1,
         "phase2.cache": 64,
         "evaluation.episodes": 2,
+        "evaluation.weak_share": because(0.0, "nobody plays"),
     },
 )
 

@@ -165,11 +165,13 @@ class FirstMember:
         progress, steps = self.progress, self.progress.steps
         progress.rounds += 1
         progress.figures |= rules.window_figures(progress, self.spec.horizon)
-        progress.figures |= self.reports.after_round(progress.rounds) | overlap.figures()
-        figures = dict(progress.figures)
+        report = self.reports.after_round(progress.rounds)
+        progress.figures |= report | overlap.figures()
+        figures, watch = dict(progress.figures), self.config.watch
         rules.keep_best(progress, self.phase, self.config.agent.entropy_after)
         shown = {"steps": steps, self.spec.score_name: round(figures.get("real_sp", 0.0), 2)}
-        note = self.restart_if_due()
+        trouble = progress.watch.look(figures, report, watch, watch.first_rounds)
+        note = self.restart_if_due() or (trouble and f"member 1: {trouble}")
         ended = Round(FIRST, steps, figures, sampled, number=progress.rounds, at_rest=not overlap.running)
         return replace(ended, done=steps, shown=shown, note=note, work=dict(overlap.work))
 
@@ -210,6 +212,7 @@ class LaterMember:
         # Every partner's cross-play must be known to tell the strongest, in both seats.
         self.episodes_xp = max(self.phase.episodes_xp, len(self.pairs))
         self.most_rounds = rules.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
+        self.imagined: dict[str, float] = {}
 
     def train(self) -> Loop:
         """All rounds; line 1 is done."""
@@ -240,6 +243,7 @@ class LaterMember:
             task = AgentTask(count, model, starts, plan.new_share, scores, progress.plays, tally)
             update = self.work.update_agent(task).result()  # 11-15
             figures = named_figures("agent", update.metrics) | {"updates": done}
+            self.imagined = figures
             shown = {"steps": progress.steps, "entropy": round(update.metrics["entropy"], 2), **best}
             done += count
             yield Progress(self.member, progress.steps, figures, done=done, shown=shown)
@@ -262,7 +266,9 @@ class LaterMember:
         progress.steps += real.steps_of(sampled)
         scored = rules.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
         progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
-        note = rules.describe_round(progress, scored, self.spec.score_name)
+        note, watch = rules.describe_round(progress, scored, self.spec.score_name), self.config.watch
+        if trouble := progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds):
+            note += f"; {trouble}"
         rests, number = rules.plays_on(progress, self.phase, self.most_rounds), progress.rounds
         ended = Round(self.member, progress.steps, progress.figures, tuple(sampled), number=number, at_rest=rests)
         return replace(ended, note=f"member {self.member}, {note}")
