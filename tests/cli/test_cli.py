@@ -322,6 +322,7 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
         "members": 2,
         "ledger": {"1": {"SP": 1234, "total": 1234}, "total": {"SP": 1234, "total": 1234}},
         "matrix": {"mean": [[9.0, 0.25], [float("nan"), 8.0]], "standard_error": [[0.5, 0.1], [None, 0.1]]},
+        "weak_members": [],
         "seconds": 90.0,
     }
     environment = {"name": "overcooked/cramped_room"}
@@ -353,6 +354,9 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
     assert code == 0 and "9.00" in out and "±0.50" in out and "1,234" in out
     assert "obstruction: XP is below play beside random partners" in out
     assert out.splitlines()[-1] == "population: runs/r/population   ledger, checkpoints and reports: runs/r"
+    result["weak_members"] = ["member 2 does not play"]
+    code, out, _ = run("run", "scale=smoke", "--quiet")
+    assert code == 3 and out.splitlines()[-1] == "member 2 does not play"
 
 
 def test_show(run: Run, random_population: Path) -> None:
