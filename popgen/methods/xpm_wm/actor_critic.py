@@ -41,7 +41,8 @@ class Actor(nn.Module):
 
     def inputs(self, latent: Latent, seat: Tensor) -> Tensor:
         """Network inputs of the players in `seat` (...,) int64, one per model state (..., .)."""
-        parts = [latent.z * self.masks[seat], self.seats[seat]]
+        dtype = latent.z.dtype  # a mask of more precision would widen the latents, which layers then narrow again
+        parts = [latent.z * self.masks.to(dtype)[seat], self.seats.to(dtype)[seat]]
         return torch.cat([latent.h, *parts] if self.use_h else parts, -1)
 
     def log_probs(self, latent: Latent, seat: Tensor) -> Tensor:
@@ -81,7 +82,7 @@ class Critic(nn.Module):
 
     def logits(self, latent: Latent, seat: Tensor) -> Tensor:
         """(..., bins)."""
-        return self.net(torch.cat([latent.h, latent.z, self.seats[seat]], -1))
+        return self.net(torch.cat([latent.h, latent.z, self.seats.to(latent.z.dtype)[seat]], -1))
 
     def value(self, latent: Latent, seat: Tensor) -> Tensor:
         """(...) expected return."""
