@@ -51,6 +51,7 @@ SMOKE = Recipe(
     "Seconds, for tests: every code path once, nothing learned.",
     {
         "evaluation.episodes": 2,
+        "evaluation.weak_share": 0.0,
         "ppo.units": 16,
         "ppo.layers": 1,
         "ppo.envs": 4,

@@ -52,6 +52,7 @@ SMOKE = Recipe(
     "Seconds, for tests: every code path once, nothing learned.",
     {
         "evaluation.episodes": 2,
+        "evaluation.weak_share": 0.0,
         "xpm_sim.units": 16,
         "xpm_sim.layers": 1,
         "xpm_sim.capacity": 4000,
