@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -27,6 +28,34 @@ QUOTES = "'\""
 
 CHOICES = ("method", "scale", "env")
 """Groups that decide which schema and which recipe the other settings stand on."""
+
+
+@dataclass(frozen=True)
+class SweepAxis:
+    """A setting that a sweep varies.
+
+    Attributes:
+        key: dotted, or a group.
+        values: as words of the command line; none where the setting is drawn from [low, high].
+        is_log: drawn evenly by its logarithm.
+        is_integer: whole numbers.
+    """
+
+    key: str
+    values: tuple[str, ...] = ()
+    low: float = 0.0
+    high: float = 0.0
+    is_log: bool = False
+    is_integer: bool = False
+
+    def draw_value(self, rng: Any) -> str:
+        """A value from the range, by a numpy generator."""
+        if self.is_integer and not self.is_log:
+            return str(int(rng.integers(int(self.low), int(self.high) + 1)))
+        ends = (math.log(self.low), math.log(self.high)) if self.is_log else (self.low, self.high)
+        drawn = float(rng.uniform(*ends))
+        value = math.exp(drawn) if self.is_log else drawn
+        return str(round(value)) if self.is_integer else f"{value:.4g}"
 
 
 @dataclass(frozen=True)
@@ -85,6 +114,33 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     return Composed(values, recipe.list_settings(layout), _list_presets(translated, folder), tuple(keys), schema)
 
 
+def parse_axis(override: str) -> SweepAxis | None:
+    """The axis that an override with several values or a range means; None for one with a single value.
+
+    Raises:
+        UserError: it cannot be read, or a range is empty or has no logarithm.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.core.override_parser.types import IntervalSweep
+    from hydra.errors import HydraException
+
+    word = _translate(override)
+    try:
+        parsed = OverridesParser.create().parse_override(word)
+        if not parsed.is_sweep_override():
+            return None
+        sweep, key = parsed.value(), word.lstrip("+").partition("=")[0]
+        if not isinstance(sweep, IntervalSweep):
+            return SweepAxis(key, tuple(parsed.sweep_string_iterator()))
+    except (HydraException, ValueError, OverflowError):
+        raise UserError("overrides", f"cannot read {short(override)!r}", "write KEY=a,b or KEY=interval(a,b)") from None
+    low, high = float(sweep.start or 0.0), float(sweep.end or 0.0)
+    whole = isinstance(sweep.start, int) and isinstance(sweep.end, int) and "int(" in word
+    if not low < high or ("log" in sweep.tags and low <= 0.0):
+        raise UserError(key, f"[{low:g}, {high:g}] is no range to draw from", "give an ascending, positive one")
+    return SweepAxis(key, low=low, high=high, is_log="log" in sweep.tags, is_integer=whole)
+
+
 def choose_method(overrides: Sequence[str], config_dir: str | None = None) -> str:
     """The method that overrides, or a preset that they name, choose.
 
@@ -125,6 +181,42 @@ def _flatten(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def compose_record(record: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """The configuration that a run recorded, with overrides of fields; the run gets a name of its own.
+
+    `cluster=NAME` and `tracking=NAME` take what conf/ says in place of what was recorded.
+
+    Raises:
+        UserError: an override that cannot be read, or one that asks for another recipe.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+
+    from popgen.conf import DIRECTORY
+
+    config = OmegaConf.create({**record, "run": {**record.get("run", {}), "id": None}})
+    for override in overrides:
+        word = _translate(override).lstrip("+")
+        key = word.partition("=")[0]
+        if key in CHOICES:
+            raise UserError(key, "is that of the record", f"leave it out, or start without --from {key}=...")
+        try:
+            parsed = OverridesParser.create().parse_override(word)
+            if parsed.is_delete() or parsed.is_sweep_override():
+                raise UserError("overrides", f"cannot read {short(override)!r}", "write KEY=VALUE")
+            if (value := parsed.value()) in group_options(key):
+                config[key] = OmegaConf.load(DIRECTORY / key / f"{value}.yaml")
+            else:
+                OmegaConf.update(config, key, value)
+        except (HydraException, ValueError) as error:
+            first = str(error).partition("\n")[0]
+            raise UserError("overrides", f"cannot read {short(override)!r} ({first})", "write KEY=VALUE") from None
+    values = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
 
 
 def _preset_folder(path: str) -> Path:

@@ -16,6 +16,7 @@ from popgen.cli import humans_commands as humans
 from popgen.cli import play_command as play
 from popgen.cli import population_commands as population
 from popgen.cli import run_command as run
+from popgen.cli import sweep_command as sweep
 from popgen.cli.arguments import Parser, expand_home
 from popgen.cli.printing import ERROR
 from popgen.errors import UserError
@@ -54,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"popgen {popgen.__version__}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
-    for subject in (run, configuration, evaluation, population, ego, play, comparison, experiments, humans, bench):
+    subjects = (run, sweep, configuration, evaluation, population, ego, play, comparison, experiments, humans, bench)
+    for subject in subjects:
         subject.add(commands)
     return parser

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping
 from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir
-from popgen.cli.compose import compose, to_yaml
+from popgen.cli.compose import compose, compose_record, to_yaml
 from popgen.cli.printing import OK, WEAK, print_json, print_table
 from popgen.cli.training import before_ray, tell_notes
+from popgen.durable_files import read_regular
+from popgen.errors import UserError
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
@@ -37,13 +41,20 @@ def add(commands: Any) -> None:
         "--dry-run", action="store_true", help="check everything, print the configuration, start nothing"
     )
     add_config_dir(parser)
+    parser.add_argument(
+        "--from", dest="record", default=None, metavar="RUN", help="repeat that run's settings, with the overrides"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Train a population and evaluate it, or say what would be done."""
     from popgen.config.run_config import RunConfig
 
-    return execute(RunConfig.parse(compose(args.overrides, args.config_dir)), args)
+    if args.record is None:
+        values = compose(args.overrides, args.config_dir)
+    else:
+        values = compose_record(read_record(args.record), args.overrides)
+    return execute(RunConfig.parse(values), args)
 
 
 def execute(config: RunConfig, args: argparse.Namespace) -> int:
@@ -79,6 +90,23 @@ def execute(config: RunConfig, args: argparse.Namespace) -> int:
     else:
         _print_run(result)
     return WEAK if result["weak_members"] else OK
+
+
+def read_record(run: str) -> dict[str, Any]:
+    """`config.json` of a run's folder.
+
+    Raises:
+        UserError: there is none that can be read.
+    """
+    path = Path(run) / "config.json"
+    try:
+        values = json.loads(read_regular(path))
+    except (OSError, ValueError, RecursionError) as error:
+        problem = f"cannot read {path} ({getattr(error, 'strerror', None) or 'it is no JSON'})"
+        raise UserError("--from", problem, "give a run's folder") from None
+    if not isinstance(values, dict):
+        raise UserError("--from", f"{path} holds no settings", "give a run's folder")
+    return values
 
 
 def _print_config(values: dict[str, Any], as_json: bool) -> int:

@@ -98,7 +98,7 @@ def leave_out_foreign(
     kept = [list(words) for words in overrides]
     for words, method in zip(kept, methods, strict=False):
         foreign = set().union(*fields.values()) - fields[method]
-        for word in shared:
+        for word in [word for word in words if word in shared]:
             if word.lstrip("+~").partition("=")[0] in foreign:
                 words.remove(word)
                 notes[f"{word} is left out for {method}, which has no such setting"] = None

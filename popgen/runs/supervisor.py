@@ -64,6 +64,12 @@ def guarded(folder: Path, retries: int) -> int | None:
     return None
 
 
+def end_with_parent() -> None:
+    """Have this process killed when the thread that made it ends (Linux)."""
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
+
+
 def _fork_child() -> int:
     """The child's id in this process, 0 in the child."""
     sys.stdout.flush()
@@ -72,7 +78,7 @@ def _fork_child() -> int:
     if (pid := os.fork()) != 0:
         return pid
     os.setpgid(0, 0)
-    ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
+    end_with_parent()
     if os.getppid() != parent:  # it was gone before we could say so
         os._exit(RAY_ENDED_US)
     return 0

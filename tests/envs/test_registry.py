@@ -53,7 +53,7 @@ def test_simulate_is_step_for_any_leading_shape(name):
     following, simulated = env.simulate(before.reshape(2, BATCH // 2, -1), actions.reshape(2, BATCH // 2, 2))
     assert np.array_equal(env.get_state(), before), "simulate must not touch the environment's own states"
     batch = env.step(actions)
-    assert np.array_equal(following.reshape(before.shape), env.get_state()) and batch.truncated.any()
+    assert np.array_equal(following.reshape(before.shape), env.get_state()) and batch.done.any()
     for field in dataclasses.fields(batch):
         stepped, pure = getattr(batch, field.name), getattr(simulated, field.name)
         assert pure.shape[:2] == (2, BATCH // 2) and np.array_equal(pure.reshape(stepped.shape), stepped), field.name
@@ -181,14 +181,14 @@ def test_done_happens_once_and_nothing_resets_by_itself(name):
     assert env.time(env.get_state()).tolist() == list(range(horizon - BATCH, horizon))
     still = np.zeros((BATCH, 2), dtype=np.int64)
     batch = env.step(still)
-    assert batch.truncated.tolist() == [False] * (BATCH - 1) + [True]
+    assert batch.done.tolist() == [False] * (BATCH - 1) + [True]
     assert not (batch.truncated & batch.terminated).any()
     np.testing.assert_array_equal(batch.done, batch.truncated | batch.terminated)
     times = env.time(env.get_state())
     assert times.tolist() == list(range(horizon - BATCH + 1, horizon + 1)) and times.dtype == np.int64
     env.reset(indices=np.flatnonzero(batch.done))
     assert env.time(env.get_state()).tolist() == [*range(horizon - BATCH + 1, horizon), 0]
-    assert env.step(still).truncated.tolist() == [False] * (BATCH - 2) + [True, False]
+    assert env.step(still).done.tolist() == [False] * (BATCH - 2) + [True, False]
 
 
 def test_time_takes_any_leading_shape(name):
