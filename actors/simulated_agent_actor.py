@@ -58,7 +58,7 @@ class SimulatedAgentActor:
         for by_kind in segments:
             for part in by_kind.values():
                 self.learner.starts.add(part.result())
-        self.learner.partner_scores, self.learner.multipliers = dict(strength), dict(multipliers)
+        self.learner.partner_scores, self.learner.constraint.multipliers = dict(strength), dict(multipliers)
 
     def learn(self, updates: int) -> Learned:
         """Simulate and update `updates` times."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +17,10 @@ from popgen.progress import Reporter
 from popgen.reports import sabotage_report
 from popgen.reports.charts.chart_style import Pictures
 from popgen.reports.charts.path_charts import PathSample, path_grid, path_samples
-from popgen.reports.method_titles import name_of, title_of
-from popgen.reports.paper_figures import SABOTAGE
+from popgen.reports.method_titles import title_of
 from popgen.reports.sabotage_report import TERMINATIONS, build_report, termination_of
 from popgen.runs.ledger import Ledger
 from popgen.types import Kind, LedgerEntry
-
-METHODS = tuple(name_of(row.method) for row in SABOTAGE)
-"""Rows of the paper's table."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class _Measured:
     def file(self) -> str:
         """Part of the names of its files."""
         seed = self.source.population.manifest.seed
-        parts = (self.source.label.replace("/", "_"), self.termination, f"s{seed}")
+        parts = (re.sub(r"[/:]", "_", self.source.label), self.termination, f"s{seed}")
         return "-".join(part for part in parts if part)
 
 
@@ -93,7 +90,7 @@ def _check_alike(sources: Sequence[Source], new: Source) -> None:
 
 def self_sabotage(
     sources: Sequence[tuple[str, str | Path]],
-    starts: Sequence[RunConfig],
+    starts: Sequence[tuple[str, RunConfig]],
     out: str | Path,
     *,
     episodes: int,
@@ -104,7 +101,7 @@ def self_sabotage(
 
     Args:
         sources: (method or another name, folder of a population or run).
-        starts: runs to start first, see `popgen.pipelines.run_batch`.
+        starts: (method, or method:objective, and the run to start first), see `popgen.pipelines.run_batch`.
         out: folder of the report, its figures and `ledger.jsonl`, which counts the evaluation's steps.
         episodes: per ordered pair of members.
         seed: of the evaluation.
@@ -117,8 +114,8 @@ def self_sabotage(
         UserError: see `open_sources`; a run that fails; a folder that cannot be written.
     """
     open_sources(sources)
-    folders = run_all(starts, reporter=reporter)
-    trained = [(config.method, folder) for config, folder in zip(starts, folders, strict=True)]
+    folders = run_all([config for _, config in starts], reporter=reporter)
+    trained = [(label, folder) for (label, _), folder in zip(starts, folders, strict=True)]
     opened = open_sources([*sources, *trained])
     if not opened:
         raise UserError("populations", "there are none to measure", "give --population METHOD=PATH or methods to train")
@@ -188,6 +185,7 @@ def _describe_population(one: _Measured) -> dict[str, Any]:
         "training_steps": {kind: sum(member.steps.get(kind, 0) for member in members) for kind in kinds},
         **{name: figures[name] for name in ("members", "self_sabotage", "average", "ended_early")},
         **{name: figures[name] for name in ("average_ended_early", "sp", "xp", "landmarks", "matrix", "exits")},
+        **{name: figures[name] for name in ("xp_apart", "pairs", "beside")},
         "scored": {rule: {"sp": dues["sp"], "xp": dues["xp"]} for rule, dues in paid.items()},
     }
 

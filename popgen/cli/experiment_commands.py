@@ -27,10 +27,12 @@ def _add_self_sabotage(kinds: Any) -> None:
         kinds,
         "self-sabotage",
         self_sabotage,
-        "who leaves the task in cross-play: LIPO, CoMeDi and XPM-Sim on rendezvous, beside the paper's first table",
-        "Without --population all three are trained, 8 agents each, in DIR/runs (what is finished there is not trained "
-        "again); overrides are those of `popgen run`. Keys of --json: those of popgen/reports/sabotage_report.py "
-        "(rows, means, paper, steps, ...) and files.",
+        "who leaves the task in cross-play: self-play, XPM-Sim, LIPO and CoMeDi on rendezvous, beside the paper's "
+        "first table",
+        "Without --population every row is trained, 8 agents each, in DIR/runs (what is finished there is not trained "
+        "again, what was interrupted goes on); overrides are those of `popgen run`. A row is a method, or one with one "
+        "of its objectives: self-play, paper, or ours, which has the same further options in every method. Keys of "
+        "--json: those of popgen/reports/sabotage_report.py (rows, means, paper, steps, ...) and files.",
     )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings of what is trained")
     parser.add_argument(
@@ -41,12 +43,18 @@ def _add_self_sabotage(kinds: Any) -> None:
         metavar="METHOD=PATH",
         help="a finished population or run",
     )
-    parser.add_argument("--method", action="append", metavar="METHOD", help="what to train (the paper's three)")
+    parser.add_argument(
+        "--method",
+        action="append",
+        default=[],
+        metavar="METHOD[:OBJECTIVE]",
+        help="a row to train, such as xpm_sim:paper (every row)",
+    )
     add_config_dir(parser)
     parser.add_argument(
         "--termination",
         choices=("penalty", "plain", "both"),
-        default="both",
+        default="penalty",
         help="what an exit costs in training: the worst reward for every step left, nothing, or both (%(default)s)",
     )
     parser.add_argument("--seeds", type=numbers, default=[1], metavar="1,2,...", help="of training (1)")
@@ -74,30 +82,31 @@ def _add_shared_encoder(kinds: Any) -> None:
 
 def self_sabotage(args: argparse.Namespace) -> int:
     """Train what is not given, and tell who leaves the task in cross-play."""
-    from popgen.methods.registry import find_method
-    from popgen.reports.sabotage_report import list_paper_methods
+    from popgen.methods.registry import find_objective, list_objectives
 
-    methods = [find_method(name).name for name in args.method or ([] if args.population else list_paper_methods())]
-    if args.overrides and not methods:
+    rows = args.method or ([] if args.population else list_objectives())
+    objectives = {row: find_objective(row) for row in rows}
+    if args.overrides and not rows:
         raise UserError("overrides", "have no use where nothing is trained", "name what to train with --method")
     from popgen.reports.sabotage_report import NOTES, TERMINATIONS, summary, to_sheets
 
     rules = list(TERMINATIONS) if args.termination == "both" else [args.termination]
     base = [*_rendezvous(args.overrides), "population.size=8", *args.overrides]
     penalties = [f"env.params.exit_penalty={TERMINATIONS[rule]['exit_penalty']}" for rule in rules]
-    overrides = [
-        [*base, f"method={method}", penalty, f"seed={seed}"]
-        for penalty in penalties
-        for method in methods
-        for seed in args.seeds
-    ]
+    asked = [(row, penalty, seed) for penalty in penalties for seed in args.seeds for row in rows]
+    overrides = []
+    for row, penalty, seed in asked:
+        changes = [f"{name}={'null' if value is None else value}" for name, value in objectives[row].items()]
+        method = row.partition(":")[0]
+        overrides.append([*base, f"method={method}", *changes, *args.overrides, penalty, f"seed={seed}"])
     configs = runs_to_start(overrides, args.out, args.overrides, args.config_dir, quiet=args.quiet)
+    starts = [(row, config) for (row, *_), config in zip(asked, configs, strict=True)]
     from popgen.pipelines import experiments
     from popgen.progress import make_reporter
 
     with closing(make_reporter(quiet=args.quiet)) as reporter:
         report = experiments.self_sabotage(
-            args.population, configs, args.out, episodes=args.episodes, seed=args.seed, reporter=reporter
+            args.population, starts, args.out, episodes=args.episodes, seed=args.seed, reporter=reporter
         )
     if args.json:
         print_json(report)

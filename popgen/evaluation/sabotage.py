@@ -4,14 +4,18 @@ The measure of the paper's section "Empirical Analysis of Self-Sabotage Behavior
 environment". It needs an environment with an event that says which player left.
 
 For agent m and each earlier agent k < m, both seatings are played. The paper counts every episode that ended early,
-whoever ended it (`ended_early` here). An agent cannot help what its partner does, so the headline figure
-(`self_sabotage`) counts only the episodes in which agent m itself left; where both leave in the same step, both count.
-Agent 1 has no earlier agents; as in the paper it stands as 0 and counts in the average.
+whoever ended it (`ended_early`, "any exit"). An agent cannot help what its partner does, so that `self_sabotage` ("own
+exit") counts the episodes in which agent m itself left; where both leave in the same step, both count. Agent 1 has no
+earlier agents; as in the paper it stands as 0 and counts in the average.
+
+Not to leave is no merit of members that share one convention: what they share stands beside it. Of two members at one
+landmark cross-play is as good as self-play; `xp_apart` is that of the other pairs, and what members get beside a random
+and an idle partner tells how much of it is a convention that the partner does not have.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,10 +24,12 @@ import numpy as np
 from popgen.envs.contract import BatchedEnv, EnvSpec
 from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
+from popgen.evaluation.crossplay import PARTNERS
 from popgen.evaluation.estimates import Estimate
 from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
-from popgen.play.rollout import Transition, play
+from popgen.play.rollout import Transition, play, play_teams
+from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 from popgen.population.store import Population
 
 LEAVES = "leaves"
@@ -72,6 +78,7 @@ class SabotageResult:
         exits: (M, M, N, P) bool, who left; [i, j] is member i + 1 in seat 0 with member j + 1 in seat 1.
         ended: (M, M, N) bool, the episode ended before the horizon.
         scores: (M, M, N), the episodes' scores.
+        beside: partner (`random`, `idle`) -> the members' mean score with it, both seatings.
         landmarks: (M, K) how many self-play episodes of a member ended at each landmark; None without landmarks.
         paths: None where players do not move on a plane.
     """
@@ -85,6 +92,7 @@ class SabotageResult:
     exits: np.ndarray
     ended: np.ndarray
     scores: np.ndarray
+    beside: Mapping[str, Estimate]
     landmarks: np.ndarray | None
     paths: Paths | None
 
@@ -123,8 +131,24 @@ class SabotageResult:
     @property
     def xp(self) -> Estimate:
         """Mean cross-play score over ordered pairs of different members; NaN for one member."""
-        pairs = [(i, j) for i in range(self.size) for j in range(self.size) if i != j]
-        return Estimate.average([Estimate.of(self.scores[pair]) for pair in pairs])
+        return self._average_pairs([(i, j) for i in range(self.size) for j in range(i)])
+
+    @property
+    def xp_apart(self) -> Estimate:
+        """Mean cross-play score of the pairs that do not share a landmark; NaN where there is none."""
+        shared = set(self.sharing)
+        return self._average_pairs([(i, j) for i in range(self.size) for j in range(i) if (j + 1, i + 1) not in shared])
+
+    def _average_pairs(self, pairs: Sequence[tuple[int, int]]) -> Estimate:
+        """Mean over pairs, counted from 0, in both seatings."""
+        return Estimate.average([Estimate.of(self.scores[seats]) for i, j in pairs for seats in ((i, j), (j, i))])
+
+    @property
+    def sharing(self) -> list[tuple[int, int]]:
+        """Pairs of members (from 1, the earlier first) whose self-play ends at the same landmark."""
+        used = [self.landmark(member + 1) for member in range(self.size)]
+        pairs = [(i, j) for j in range(self.size) for i in range(j)]
+        return [(i + 1, j + 1) for i, j in pairs if used[i] is not None and used[i] == used[j]]
 
     def landmark(self, member: int) -> int | None:
         """Landmark (from 1) at which more than half of a member's self-play ends; None where there is none."""
@@ -181,6 +205,7 @@ def measure_sabotage(
     policies: list[Policy] = [population[member + 1] for member in range(count)]
     recorder = _PositionRecorder(env)
     played = play(env, policies, np.repeat(matches, episodes, axis=0), seed=seed, record=recorder)
+    besides = _play_beside(population, policies, episodes, seed, env.spec.params)
     shape = (count, count, episodes)
     exits = (played.events[..., event] > 0).reshape(*shape, -1)
     return SabotageResult(
@@ -189,13 +214,39 @@ def measure_sabotage(
         event=env.spec.event_names[event],
         episodes=episodes,
         seed=seed,
-        steps=played.steps,
+        steps=played.steps + besides.steps,
         exits=exits,
         ended=(played.length < env.spec.horizon).reshape(shape),
         scores=played.score.reshape(shape),
+        beside=_estimate_beside(besides.score.reshape(len(PARTNERS), 2 * count, episodes)),
         landmarks=_count_landmarks(env, recorder, played, shape),
         paths=_first_paths(env, recorder, exits, shape),
     )
+
+
+def _play_beside(
+    population: Population, policies: Sequence[Policy], episodes: int, seed: int, params: Mapping[str, Any]
+) -> Episodes:
+    """Every member in both seats with each of PARTNERS: rows by partner, member, seat and episode."""
+    info, count = population.env_info, len(policies)
+    spec = population.spec
+    others: list[Policy] = [RandomPolicy(spec.num_actions), IdlePolicy(spec.action_names)]
+    numbers = range(count, count + len(PARTNERS))
+    matches = [pair for k in numbers for member in range(count) for pair in ((member, k), (k, member))]
+    rules = dict(params)
+    return play_teams(
+        lambda size, first: make_env(info.name, size, seed=first, **rules),
+        [*policies, *others],
+        matches,
+        episodes,
+        seed=seed,
+    )
+
+
+def _estimate_beside(scores: np.ndarray) -> dict[str, Estimate]:
+    """Of scores (partners, pairs, N)."""
+    means = [Estimate.average([Estimate.of(pair) for pair in part]) for part in scores]
+    return dict(zip(PARTNERS, means, strict=True))
 
 
 class _PositionRecorder:
@@ -264,6 +315,9 @@ def to_dict(result: SabotageResult) -> dict[str, Any]:
         "average_ended_early": result.average_ended_early,
         "sp": result.sp.to_dict(),
         "xp": result.xp.to_dict(),
+        "xp_apart": result.xp_apart.to_dict(),
+        "pairs": {"all": result.size * (result.size - 1) // 2, "sharing": [list(pair) for pair in result.sharing]},
+        "beside": {partner: mean.to_dict() for partner, mean in result.beside.items()},
         "matrix": result.scores.mean(axis=-1).tolist(),
         "exits": result.exits.mean(axis=2).tolist(),
         "landmarks": _describe_landmarks(result),

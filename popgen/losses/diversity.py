@@ -9,8 +9,8 @@ A sign is applied to the advantage before any surrogate or clipping; value losse
 Two further options of every such objective, ours:
 
     a bound       cross-play's advantages count for at most `clip` spreads of self-play's
-    a constraint  maximise J_SP(j) subject to J_XP(j, k) <= limit for every k, by a multiplier m_k in [0, 1]:
-                  lambda_XP m_k stands where lambda_XP stood
+    a constraint  maximise J_SP(j) subject to J_XP(j, k) <= limit for every k, by multipliers m_k in [0, 1]: not the
+                  strongest partner's J_XP falls, but one that is drawn in proportion to m_k, with lambda_XP max_k m_k
 """
 
 from __future__ import annotations

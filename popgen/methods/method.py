@@ -9,7 +9,7 @@ from typing import Any
 
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
-from popgen.methods.recipe import Recipe
+from popgen.methods.recipe import Recipe, Settings
 from popgen.methods.transport import OpenTraining
 
 
@@ -87,6 +87,8 @@ class Method:
         check: refuses a configuration that cannot work in an environment, by a `UserError`.
         policies: policy kind -> `module:class` of the members that it saves, beside those of `popgen.policies`.
         continuation: what a population to continue must have in common; None where the method cannot continue one.
+        objectives: its rows in a table of self-sabotage: name -> settings on top of a recipe. A name means the same in
+            every method: `self-play` (no partner), `paper` (the paper's objective) and `ours` (with our options).
     """
 
     name: str
@@ -102,6 +104,7 @@ class Method:
     check: Callable[[Any, EnvSpec], None] = _accept
     policies: Mapping[str, str] = field(default_factory=dict)
     continuation: Continuation | None = None
+    objectives: Mapping[str, Settings] = field(default_factory=dict)
 
     def load_training(self) -> OpenTraining:
         """The start of its workers."""

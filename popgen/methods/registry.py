@@ -18,6 +18,7 @@ from typing import Any
 from popgen.config.run_config import RunConfig, field_names
 from popgen.errors import UserError
 from popgen.methods.method import Method
+from popgen.methods.recipe import Settings
 
 GROUP = "popgen.methods"
 
@@ -100,6 +101,26 @@ def find_method(name: object) -> Method:
     close = difflib.get_close_matches(str(name), METHODS, n=1)
     fix = f"did you mean {close[0]}?" if close else f"choose one of {', '.join(METHODS)}"
     raise UserError("method", f"there is no method {name!r}", fix)
+
+
+def list_objectives() -> list[str]:
+    """`method:objective` of every row that a table of self-sabotage can have, self-play first."""
+    labels = [f"{name}:{objective}" for name, method in METHODS.items() for objective in method.objectives]
+    return sorted(labels, key=lambda label: not label.endswith(":self-play"))
+
+
+def find_objective(row: str) -> Settings:
+    """What a row, `method` or `method:objective`, has on top of a recipe: nothing for a method alone.
+
+    Raises:
+        UserError: no such method, or it has no such objective.
+    """
+    name, _, objective = row.partition(":")
+    known = find_method(name).objectives
+    if objective and objective not in known:
+        fix = f"choose one of {', '.join(known)}" if known else f"give {name} alone"
+        raise UserError("method", f"{name} has no objective {objective!r}", fix)
+    return known[objective] if objective else {}
 
 
 def methods_with(key: str) -> list[str]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from popgen.losses.diversity import next_multiplier
 
@@ -13,6 +15,9 @@ class PartnerConstraint:
 
     Every multiplier is 1 until its partner has been met, so that the pressure is whole while conventions are chosen.
     Below the limit there is nothing to gain: a member that holds to a convention of its own has no reason to do worse.
+    A partner is drawn in proportion to the multipliers: the strongest may be one whose convention has to be shared, as
+    there are fewer conventions than members, and under max_k it would take the whole pressure, which only sabotage
+    could relieve.
 
     Args:
         limit: a score; None: there is no constraint, and every multiplier is 1.
@@ -31,9 +36,19 @@ class PartnerConstraint:
             now = self.multiplier(partner)
             self.multipliers[partner] = next_multiplier(now, score, self_play, limit=self.limit, step=self.step)
 
+    def draw_partner(self, partners: Sequence[int], rng: np.random.Generator) -> int:
+        """One of the partners, in proportion to their multipliers; any where all of these are 0."""
+        weights = np.array([self.multiplier(partner) for partner in partners])
+        total = weights.sum()
+        return int(rng.choice(list(partners), p=weights / total if total else None))
+
     def multiplier(self, partner: int) -> float:
         """m_k in [0, 1]."""
         return self.multipliers.get(partner, 1.0)
+
+    def pressure(self, partners: Sequence[int]) -> float:
+        """The largest multiplier of the partners: the share of lambda_XP that one of them, drawn, gets."""
+        return max(self.multiplier(partner) for partner in partners)
 
     def state(self) -> dict[str, float]:
         """JSON-able."""

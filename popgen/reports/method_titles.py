@@ -8,8 +8,11 @@ __all__ = ["METHODS", "name_of", "title_of"]
 
 
 def title_of(label: str) -> str:
-    """A method's title; other labels stay as they are."""
-    return METHODS[label].title if label in METHODS else label
+    """A method's title, with the name of the objective where there is one; other labels stay as they are."""
+    method, _, objective = label.partition(":")
+    if method not in METHODS or (objective and objective not in METHODS[method].objectives):
+        return label
+    return f"{METHODS[method].title}, {objective}" if objective else METHODS[method].title
 
 
 def name_of(title: str) -> str:

@@ -9,11 +9,14 @@ Keys of the JSON object (`self_sabotage.json`); a figure is `{"mean": x, "standa
     rows                     one a population: method, name, termination (`plain` or `penalty`: the rule by which an
                              exit is paid in training), training_seed, population (path), training_steps (by kind),
                              members, self_sabotage and ended_early (a fraction per member), average,
-                             average_ended_early, sp, xp, scored (sp and xp of the same episodes paid by each rule),
-                             landmarks (used, members: the landmark of each one's self-play or null, counts), matrix
-                             (mean score, row = seat 0), exits (fraction per ordered pair and seat)
+                             average_ended_early, sp, xp, xp_apart (of pairs that do not share a landmark), pairs (all:
+                             how many, sharing: those at one landmark), beside (mean score with a random and an idle
+                             partner), scored (sp and xp of the same episodes paid by each rule), landmarks (used,
+                             members: the landmark of each one's self-play or null, counts), matrix (mean score, row =
+                             seat 0), exits (fraction per ordered pair and seat)
     means                    over the populations of one method and termination: populations, and mean, low and high of
-                             average, average_ended_early, sp and xp
+                             average, average_ended_early, sp, xp, xp_apart, sharing (pairs at one landmark), random and
+                             idle (beside them)
     paper                    method -> agents, average, sp and xp of the paper's table
 """
 
@@ -25,10 +28,12 @@ from typing import Any
 
 import pandas as pd
 
+from popgen.evaluation.crossplay import IDLE, PARTNERS, RANDOM
 from popgen.reports.frames import UNKNOWN, Sheet, number_text, range_text, spread_of, to_csv
 from popgen.reports.method_titles import name_of, title_of
 from popgen.reports.paper_figures import SABOTAGE
 
+MEANS = ("sp", "xp", "xp_apart")
 PLAIN, PENALTY = "plain", "penalty"
 TERMINATIONS: dict[str, dict[str, Any]] = {
     PENALTY: {"exit_penalty": "absorbing", "exit_reward": None},
@@ -66,11 +71,6 @@ def termination_of(params: Mapping[str, Any]) -> str:
     return next((name for name, rule in TERMINATIONS.items() if params.get("exit_penalty") == rule["exit_penalty"]), "")
 
 
-def list_paper_methods() -> list[str]:
-    """Names of the methods in the paper's table."""
-    return [name_of(row.method) for row in SABOTAGE]
-
-
 def build_report(environment: str, episodes: int, seed: int, steps: int, rows: Sequence[Mapping[str, Any]]) -> dict:
     """The JSON object of the module's docstring, from its rows."""
     return {
@@ -91,9 +91,14 @@ def build_report(environment: str, episodes: int, seed: int, steps: int, rows: S
 
 def _average_populations(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Of each method and termination."""
-    names = ("average", "average_ended_early", "sp", "xp")
     heads = ("method", "name", "termination")
-    cells = [{**row, "sp": row["sp"]["mean"], "xp": row["xp"]["mean"]} for row in rows]
+    names = ("average", "average_ended_early", *MEANS, "sharing", *PARTNERS)
+    cells = [
+        {**row, "sharing": len(row["pairs"]["sharing"])}
+        | {name: row[name]["mean"] for name in MEANS}
+        | {partner: row["beside"][partner]["mean"] for partner in PARTNERS}
+        for row in rows
+    ]
     frame = pd.DataFrame(cells, columns=[*heads, *names])
     return [
         dict(zip(heads, key, strict=True))
@@ -151,12 +156,15 @@ def _our_cells(row: Mapping[str, Any]) -> dict[str, Any]:
     landmarks = row["landmarks"]
     return {
         "": f"{row['name']}, seed {row['training_seed']}",
-        "agents": [f"{value:.2f}" for value in row["self_sabotage"]],
-        "average": f"{row['average']:.3f}",
+        "agents": [f"{value:.2f}" for value in row["ended_early"]],
         "any exit": f"{row['average_ended_early']:.3f}",
+        "own exit": f"{row['average']:.3f}",
         "SP": number_text(row["sp"]["mean"]),
         "XP": _cross_play_text(row),
+        "XP apart": number_text(row["xp_apart"]["mean"]),
         "landmarks": f"{len(landmarks['used'])} of {landmarks['of']}" if landmarks else UNKNOWN,
+        "pairs at one": f"{len(row['pairs']['sharing'])} of {row['pairs']['all']}" if landmarks else UNKNOWN,
+        "beside random, idle": _beside_text(row),
     }
 
 
@@ -164,12 +172,16 @@ def _paper_cells(method: str, row: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "": f"{title_of(method)}, paper",
         "agents": [f"{value:g}" for value in row["agents"]],
-        "average": f"{row['average']:g}",
         "any exit": f"{row['average']:g}",
+        "own exit": UNKNOWN,
         "SP": number_text(row["sp"]),
         "XP": number_text(row["xp"]),
-        "landmarks": UNKNOWN,
+        **dict.fromkeys(("XP apart", "landmarks", "pairs at one", "beside random, idle"), UNKNOWN),
     }
+
+
+def _beside_text(row: Mapping[str, Any]) -> str:
+    return ", ".join(number_text(row["beside"][partner]["mean"], 1) for partner in (RANDOM, IDLE))
 
 
 def _cross_play_text(row: Mapping[str, Any]) -> str:
@@ -180,10 +192,11 @@ def _cross_play_text(row: Mapping[str, Any]) -> str:
 
 
 NOTES = (
-    "Self-sabotage: fraction of cross-play episodes with earlier agents in which this agent itself left, both "
-    "seatings. Any exit: episodes that ended early, whoever left; the paper counts these.",
-    "XP in brackets: the same episodes paid with the penalty.",
-    "Landmarks: how many of them members use in self-play.",
+    "By agent, and any exit on average: fraction of cross-play episodes with earlier agents that ended early, whoever "
+    "left, both seatings; the paper counts these. Own exit: those in which this agent itself left.",
+    "XP in brackets: the same episodes paid with the penalty. XP apart: of pairs that do not share a landmark.",
+    "Landmarks: how many of them members use in self-play; pairs at one: pairs of members that share one.",
+    "Not to leave is no merit of members that play like independent seeds: compare XP with self-play only.",
 )
 
 
@@ -193,15 +206,22 @@ def to_markdown(report: Mapping[str, Any]) -> str:
     return "".join([*parts, *(f"- {line}\n" for line in (*NOTES, *summary(report)))])
 
 
+SUMMARISED = (
+    ("any exit", "average_ended_early"),
+    ("own", "average"),
+    ("SP", "sp"),
+    ("XP", "xp"),
+    ("XP apart", "xp_apart"),
+    ("pairs at one", "sharing"),
+)
+
+
 def summary(report: Mapping[str, Any]) -> list[str]:
     """Means over populations of the same method, where there are several, and what the evaluation cost."""
     lines = []
     for row in report["means"]:
         if row["populations"] > 1:
-            parts = (
-                f"{name} {range_text(row[key], 3)}"
-                for name, key in (("average", "average"), ("SP", "sp"), ("XP", "xp"))
-            )
+            parts = (f"{name} {range_text(row[key], 3)}" for name, key in SUMMARISED)
             of = f"{row['name']} ({row['termination'] or 'as trained'}), {row['populations']} populations"
             lines.append(f"{of}: {', '.join(parts)}")
     lines.append(f"{report['episodes']} episodes per pair, {report['steps']['evaluation']:,} environment steps")

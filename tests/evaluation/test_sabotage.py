@@ -134,9 +134,9 @@ def test_scores_by_hand_under_both_rules(trio: SabotageResult) -> None:
 
 
 def test_steps_are_all_that_the_environments_took(trio: SabotageResult) -> None:
-    # All 18 rows play until the longest episode is over, which is the horizon's 50 steps.
-    assert trio.steps == 3 * 3 * 2 * 50
-    assert measured(always(RIGHT)).steps == 2 * exit_step(0.3)
+    # All rows play until the longest episode is over, which is the horizon's 50 steps: those of the 9 pairs, and of 3
+    # members in both seats beside a random and an idle partner.
+    assert trio.steps == (3 * 3 + 3 * 2 * 2) * 2 * 50
 
 
 def test_landmarks_of_self_play_that_arrives() -> None:
@@ -147,6 +147,32 @@ def test_landmarks_of_self_play_that_arrives() -> None:
     assert result.landmark(3) is None and result.landmark(4) is None
     assert result.used == sorted([result.landmark(1), result.landmark(2)])
     assert result.landmarks is not None and result.landmarks.sum(1).tolist() == [3, 3, 0, 0]
+
+
+def test_pairs_at_one_landmark_stand_apart_from_the_others() -> None:
+    """Four members that hold to their landmark, two of them to the same: none leaves, and cross-play tells why."""
+    places = ((0.75, 0.75), (-0.75, 0.75), (0.75, 0.75), (-0.75, -0.75))
+    result = measured(*(seeker(*place) for place in places))
+    assert result.sharing == [(1, 3)] and result.average_ended_early == 0.0
+    scores = result.scores.mean(-1)
+    apart = [scores[seats] for i, j in ((0, 1), (0, 3), (1, 2), (1, 3), (2, 3)) for seats in ((i, j), (j, i))]
+    assert result.xp_apart.mean == pytest.approx(np.mean(apart)) and result.xp_apart.mean < -40
+    assert scores[0, 2] > 30 and result.xp.mean > result.xp_apart.mean
+    told = to_dict(result)
+    assert told["pairs"] == {"all": 6, "sharing": [[1, 3]]}
+    assert math.isnan(measured(seeker(0.75, 0.75)).xp_apart.mean)
+
+
+def test_members_beside_an_idle_and_a_random_partner() -> None:
+    result = measured(always(STAY), always(RIGHT), episodes=20)
+    still = 50 * (1 - 0.75 * math.sqrt(2) - 0.6)
+    left = (
+        measured(always(STAY), always(RIGHT)).scores[0, 1].mean(),
+        measured(always(STAY), always(RIGHT)).scores[1, 0].mean(),
+    )
+    # Member 1 beside an idle partner is two that stay; member 2 leaves from either start.
+    assert result.beside["idle"].mean == pytest.approx((2 * still + sum(left)) / 4, abs=1e-3)
+    assert result.beside["random"].mean < 0 and result.beside["random"].error > 0
 
 
 def test_paths_end_where_the_episode_ends(trio: SabotageResult) -> None:
@@ -177,7 +203,7 @@ def row(result: SabotageResult, method: str, termination: str, seed: int) -> dic
     scored = {termination: {"sp": told["sp"], "xp": told["xp"]}}
     scored[PENALTY if termination == PLAIN else PLAIN] = {"sp": told["sp"], "xp": {"mean": -99.0}}
     names = ("members", "self_sabotage", "ended_early", "average", "average_ended_early", "sp", "xp")
-    figures = {name: told[name] for name in (*names, "landmarks", "matrix", "exits")}
+    figures = {name: told[name] for name in (*names, "landmarks", "matrix", "exits", "xp_apart", "pairs", "beside")}
     head = {"method": method, "name": method.upper(), "termination": termination, "training_seed": seed}
     return head | {"population": "here", "training_steps": {"SP": 5}, "scored": scored} | figures
 
@@ -215,11 +241,11 @@ def test_csv_has_a_row_a_member_and_the_papers(report: dict[str, Any]) -> None:
 def test_tables_stand_beside_the_papers_for_each_rule(report: dict[str, Any], trio: SabotageResult) -> None:
     text = re.sub(" +", " ", sabotage_report.to_markdown(report))
     assert (
-        text.count("| CoMeDi, paper | 0 | 0 | 0 | 0 | 0 | 0 | 0.175 | 0.57 | 0.09 | 0.09 | 30.67 | -114.01 | - |") == 2
+        text.count("| CoMeDi, paper | 0 | 0 | 0 | 0 | 0 | 0 | 0.175 | 0.57 | 0.09 | - | 30.67 | -114.01 | - | -") == 2
     )
-    assert "| LIPO, seed 1 | 0.00 | 1.00 | 0.25 | | | | | | 0.417 | 0.583 |" in text
+    assert "| LIPO, seed 1 | 0.00 | 1.00 | 0.75 | | | | | | 0.583 | 0.417 |" in text  # any exit, as the paper counts
     assert f"{trio.xp.mean:.2f} (-99.00)" in text  # exits cost nothing there: what they would with the penalty
-    assert "costs nothing" in text and "2 populations: average 0.208 (0.000 to 0.417)" in text
+    assert "costs nothing" in text and "2 populations: any exit 0.292 (0.000 to 0.583), own 0.208" in text
     assert [len(sheet.to_rich().rows) for sheet in sabotage_report.to_sheets(report)] == [2 + 3, 1 + 3]
     assert len(SABOTAGE) == 3
 

@@ -214,7 +214,7 @@ def test_self_sabotage_of_finished_populations(run: Run, tmp_path: Path) -> None
     assert lipo["xp"] == lipo["scored"]["penalty"]["xp"] and comedi["xp"] == lipo["scored"]["plain"]["xp"]
     assert comedi["xp"]["mean"] > lipo["xp"]["mean"]
     ledger = Ledger(tmp_path / "out" / "ledger.jsonl")
-    assert ledger.steps(kind="evaluation") == told["steps"]["evaluation"] == 4 * 9 * 3 * 50
+    assert ledger.steps(kind="evaluation") == told["steps"]["evaluation"] == 4 * (9 + 12) * 3 * 50
     assert {"paths-lipo-penalty-s1.png", "paths-samples-plain.svg", "self_sabotage.csv"} <= set(told["files"])
     assert all(Path(path).stat().st_size for path in told["files"].values())
     code, out, _ = run(*arguments)
@@ -222,9 +222,29 @@ def test_self_sabotage_of_finished_populations(run: Run, tmp_path: Path) -> None
     assert Ledger(tmp_path / "out" / "ledger.jsonl").steps() == 2 * told["steps"]["evaluation"]
 
 
-def test_self_sabotage_trains_the_papers_methods_under_both_rules(run: Run, trained: list[RunConfig]) -> None:
+def test_self_sabotage_trains_every_row_with_equal_options(run: Run, trained: list[RunConfig]) -> None:
+    """Each method with the paper's objective and with ours, which has the same bound and the same limit in all, and
+    self-play alone as the control."""
+    code, out, err = run("experiment", "self-sabotage", "population.size=2", "--episodes", "1", "--json")
+    assert code == 0, err
+    rows = [row["name"] for row in json.loads(out)["rows"]]
+    assert rows == [
+        "XPM-Sim, self-play",
+        *(f"{m}, {o}" for m in ("XPM-Sim", "LIPO", "CoMeDi") for o in ("paper", "ours")),
+    ]
+    control, *others = trained
+    assert (control.method, control.xpm_sim.lambda_xp, control.xpm_sim.restart_weight) == ("xpm_sim", 0.0, 0.0)
+    options = [c.xpm_sim if c.method == "xpm_sim" else c.diversity for c in others]
+    assert {(o.xp_clip, o.xp_limit) for o in options[::2]} == {(0.0, None)}
+    assert len({(o.xp_clip, o.xp_limit, o.multiplier_step) for o in options[1::2]}) == 1
+    assert all(c.xpm_sim.lambda_until == 1.0 for c in trained if c.method == "xpm_sim")  # pressure to the end
+
+
+def test_self_sabotage_trains_what_is_named_under_both_rules(run: Run, trained: list[RunConfig]) -> None:
+    methods = [word for name in ("lipo", "comedi", "xpm_sim") for word in ("--method", name)]
     code, out, err = run(
-        "experiment", "self-sabotage", "population.size=2", "--seeds", "1,2", "--episodes", "1", "--json"
+        *("experiment", "self-sabotage", "population.size=2", "--seeds", "1,2", "--episodes", "1", "--json"),
+        *("--termination", "both", *methods),
     )
     assert code == 0, err
     assert len(trained) == 12 and {config.env.name for config in trained} == {"rendezvous/mppmr"}
@@ -250,7 +270,8 @@ def test_self_sabotage_refuses_in_one_line(run: Run, tmp_path: Path, random_popu
     refused(run(*command, "--population", f"comedi={random_population}"), "no event by which a player leaves")
     refused(run(*command, "population.size=2"), "nothing is trained")
     refused(run(*command, "--population", "lipo"), "NAME=PATH")
-    refused(run("experiment", "self-sabotage", "--method", "xpm_wm"), "--method")
+    refused(run("experiment", "self-sabotage", "--method", "xpm_wm:ours"), "has no objective 'ours'")
+    refused(run("experiment", "self-sabotage", "--method", "lipo:own"), "choose one of paper, ours")
     refused(run("experiment", "self-sabotage", "population.size=0"), "population.size")
     refused(run("experiment"), "WHICH")
     assert [source.label for source in open_sources([("a", one), ("b", twin)])] == ["a", "b"]

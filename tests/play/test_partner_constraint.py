@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -47,3 +48,13 @@ def test_bounds_are_in_units_of_self_plays_spread() -> None:
     bounded = bound_advantage(given, clip=1.5, spread=0.4)
     torch.testing.assert_close(bounded, torch.tensor([-0.6, -0.1, 0.3, 0.6]))
     assert bound_advantage(given, clip=0.0, spread=torch.tensor(0.4)).tolist() == given.tolist()
+
+
+def test_partners_are_drawn_in_proportion_and_get_the_largest_multiplier() -> None:
+    constraint, rng = PartnerConstraint(-60.0, 0.5), np.random.default_rng(0)
+    constraint.multipliers = {1: 0.75, 2: 0.0, 3: 0.25}
+    drawn = np.bincount([constraint.draw_partner([1, 2, 3], rng) for _ in range(4000)], minlength=4) / 4000
+    np.testing.assert_allclose(drawn, [0.0, 0.75, 0.0, 0.25], atol=0.03)
+    assert constraint.pressure([1, 2, 3]) == 0.75 and constraint.pressure([1, 2, 3, 4]) == 1.0
+    constraint.multipliers = {1: 0.0, 2: 0.0}
+    assert {constraint.draw_partner([1, 2], rng) for _ in range(50)} == {1, 2} and constraint.pressure([1, 2]) == 0.0

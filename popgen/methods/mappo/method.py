@@ -11,7 +11,7 @@ from popgen.methods.mappo.needs import (
     estimate_together,
     list_actors,
 )
-from popgen.methods.mappo.recipes import COMEDI_RECIPES, LIPO_RECIPES, RECIPES
+from popgen.methods.mappo.recipes import COMEDI_OBJECTIVES, COMEDI_RECIPES, LIPO_OBJECTIVES, LIPO_RECIPES, RECIPES
 from popgen.methods.method import Method
 
 MAPPO = Method(
@@ -37,6 +37,7 @@ LIPO = Method(
     config=LipoRun,
     recipes=LIPO_RECIPES,
     training="popgen.methods.mappo.lipo:open_training",
+    objectives=LIPO_OBJECTIVES,
     actors=list_actors,
     needs=estimate_lipo,
     check=check_view,
@@ -51,6 +52,7 @@ COMEDI = Method(
     config=ComediRun,
     recipes=COMEDI_RECIPES,
     training="popgen.methods.mappo.comedi:open_training",
+    objectives=COMEDI_OBJECTIVES,
     actors=list_actors,
     needs=estimate_comedi,
     check=check_comedi,

@@ -81,15 +81,18 @@ class PlayRecord:
         return len(cross) == len(partners) and max(cross.values()) <= diversity.target_xp
 
     def plan(self, member: int, rounds: int) -> Plan:
-        """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`, times the
-        multiplier of the partner's constraint."""
+        """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`. The partner
+        is the strongest or, under a constraint, drawn in proportion to the multipliers."""
         diversity, partners = self.job.diversity, self.job.partners(member)
         if diversity is None or not partners:
             return Plan()
-        strength = self.partners[member].scores()
-        partner = any_then_strongest(partners, strength, diversity.partner_random, self.rng)
         weight = linear(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
-        weight *= self._move_multipliers(member, rounds).multiplier(partner)
+        if diversity.xp_limit is None:
+            strength = self.partners[member].scores()
+            partner = any_then_strongest(partners, strength, diversity.partner_random, self.rng)
+        else:
+            constraint = self._move_multipliers(member, rounds)
+            partner, weight = constraint.draw_partner(partners, self.rng), weight * constraint.pressure(partners)
         return Plan(partner, weight, diversity.lambda_mp if self.job.mixed else 0.0, diversity.xp_clip)
 
     def _move_multipliers(self, member: int, rounds: int) -> PartnerConstraint:

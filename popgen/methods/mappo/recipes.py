@@ -138,6 +138,13 @@ def _with_diversity(own: Settings) -> dict[str, Recipe]:
 
 RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}
 
+
+def _objectives(lambda_xp: float) -> dict[str, Settings]:
+    """The paper's objective, and with a bound and a constraint as XPM-Sim has them."""
+    plain = {"diversity.lambda_xp": lambda_xp, "diversity.xp_clip": 0.0, "diversity.xp_limit": None}
+    return {"paper": plain, "ours": {**plain, "diversity.xp_clip": 1.5, "diversity.xp_limit": -45.0}}
+
+
 LIPO_RECIPES = _with_diversity(
     {
         "diversity.order": because("concurrent", "all members together; `sequential` trains one after the other"),
@@ -152,3 +159,6 @@ COMEDI_RECIPES = _with_diversity(
         "diversity.lambda_mp": because(0.25, "the paper's"),
     }
 )
+
+LIPO_OBJECTIVES, COMEDI_OBJECTIVES = _objectives(0.25), _objectives(0.5)
+"""Rows of the table of self-sabotage."""

@@ -30,6 +30,7 @@ from popgen.methods.xpm_sim.simulation import BatchColumns, Partner, SimulatedBa
 from popgen.methods.xpm_sim.simulation_starts import StartStates
 from popgen.nets import weights as w
 from popgen.nets.feed_forward import FeedForwardNet, orthogonal
+from popgen.play.partner_constraint import PartnerConstraint
 from popgen.play.partner_strength import any_or_strongest
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import Kind
@@ -144,7 +145,7 @@ class XpmSimLearner:
         orthogonal(head, 0.01, torch.Generator().manual_seed(seed))
         self.partners = {k: frozen_actor(config, env.spec, weights) for k, weights in sorted(partners.items())}
         self.partner_scores: dict[int, float] = {}
-        self.multipliers: dict[int, float] = {}
+        self.constraint = PartnerConstraint(config.xp_limit, config.multiplier_step)
         self.updates = self.simulated = self.trajectories = 0
         self.evaluator = MemberCritics(config, env.spec, self.partners, self.encoder, seed + 7)
         self.critics = self.evaluator.nets
@@ -186,7 +187,7 @@ class XpmSimLearner:
     def cross_play(self, batch: SimulatedBatch, partner: int, spread: float) -> PolicyTarget:
         """What the cross-play columns with `partner` teach, in units of self-play's `spread`."""
         evaluation = self.evaluator.evaluate_cross_play(batch, partner)
-        weight = self.lambda_now() * self.multipliers.get(partner, 1.0)
+        weight = self.lambda_now() * self.constraint.pressure(list(self.partners))
         target = cross_play_target(batch, evaluation, weight=weight, spread=spread, clip=self.config.xp_clip)
         return replace(target, figures=target.figures | {"partner": float(partner)})
 
@@ -197,9 +198,12 @@ class XpmSimLearner:
         return BatchColumns(config.sims_sp, restart, 0 if partner is None else config.sims_xp)
 
     def choose_partner(self) -> int | None:
-        """The strongest by the latest real cross-play, at times a random one; None in pure self-play."""
+        """The strongest by the latest real cross-play, at times a random one; under a constraint one that is drawn in
+        proportion to the multipliers. None in pure self-play."""
         if not self.partners or self.lambda_now() == 0.0 or not self.config.sims_xp:
             return None
+        if self.config.xp_limit is not None:
+            return self.constraint.draw_partner(list(self.partners), self.rng)
         return any_or_strongest(self.partners, self.partner_scores, self.config.partner_random, self.rng)
 
     def lambda_now(self) -> float:
@@ -281,7 +285,7 @@ class XpmSimLearner:
             "simulated": self.simulated,
             "trajectories": self.trajectories,
             "partner_scores": {str(k): v for k, v in self.partner_scores.items()},
-            "multipliers": {str(k): v for k, v in self.multipliers.items()},
+            "constraint": self.constraint.state(),
             "encoder": None if self.encoder is None else self.encoder.state(),
         }
 
@@ -300,4 +304,4 @@ class XpmSimLearner:
         self.updates, self.simulated = int(state["updates"]), int(state["simulated"])
         self.trajectories = int(state["trajectories"])
         self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
-        self.multipliers = {int(k): float(v) for k, v in state["multipliers"].items()}
+        self.constraint.load_state(state["constraint"])

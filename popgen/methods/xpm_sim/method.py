@@ -3,7 +3,7 @@
 from popgen.methods.method import Method
 from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.needs import check_run, estimate_needs, list_actors
-from popgen.methods.xpm_sim.recipes import RECIPES
+from popgen.methods.xpm_sim.recipes import OBJECTIVES, RECIPES
 
 METHOD = Method(
     name="xpm_sim",
@@ -17,5 +17,6 @@ METHOD = Method(
     actors=list_actors,
     needs=estimate_needs,
     check=check_run,
+    objectives=OBJECTIVES,
     policies={"encoded": "popgen.methods.xpm_sim.encoded_policy:EncodedPolicy"},
 )

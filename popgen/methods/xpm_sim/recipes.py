@@ -32,10 +32,11 @@ LAPTOP = Recipe(
             "xpm_sim.updates": 60,
             "xpm_sim.unroll": because(50, "an episode"),
             "xpm_sim.xp_horizon": 50,
-            "xpm_sim.restart_horizon": 10,
-            "xpm_sim.xp_clip": because(1.0, f"leaving is no larger gain than another convention, {_NOTES}"),
-            "xpm_sim.lambda_xp": 1.0,
-            "xpm_sim.lambda_until": because(0.34, f"the convention is settled by then, {_NOTES}"),
+            "xpm_sim.restart_horizon": because(3, f"its steps stay at the states of cross-play, {_NOTES}"),
+            "xpm_sim.restart_weight": because(0.5, f"more teaches members to follow each other, {_NOTES}"),
+            "xpm_sim.xp_clip": because(1.5, f"leaving is no larger gain than another convention, {_NOTES}"),
+            "xpm_sim.lambda_xp": because(1.5, f"of all partners drawn in turn, {_NOTES}"),
+            "xpm_sim.xp_limit": because(-45.0, f"two members that hold to different landmarks get less, {_NOTES}"),
         },
     },
 )
@@ -111,5 +112,22 @@ PAPER = Recipe(
         "xpm_sim.episodes_xp": ours(4),
     },
 )
+
+OBJECTIVES = {
+    "self-play": {"xpm_sim.lambda_xp": 0.0, "xpm_sim.restart_weight": 0.0},
+    "paper": {
+        "xpm_sim.lambda_xp": 0.5,
+        "xpm_sim.lambda_until": 1.0,
+        "xpm_sim.xp_clip": 0.0,
+        "xpm_sim.xp_limit": None,
+        "xpm_sim.sp_weight": 0.5,
+        "xpm_sim.restart_weight": 0.5,
+        "xpm_sim.restart_horizon": 30,
+        "xpm_sim.partner_random": 0.0,
+    },
+    "ours": {"xpm_sim.lambda_until": 1.0, "xpm_sim.xp_clip": 1.5, "xpm_sim.xp_limit": -45.0},
+}
+"""Self-play alone is the control: independent seeds. `paper` is its objective, with the recipe's networks and budget;
+`ours` bounds cross-play's advantages and makes cross-play a constraint, as in every method with that row."""
 
 RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}
