@@ -9,6 +9,7 @@ import popgen
 from popgen.cli import bench_commands as bench
 from popgen.cli import compare_command as comparison
 from popgen.cli import config_command as configuration
+from popgen.cli import conventions_command as conventions
 from popgen.cli import ego_commands as ego
 from popgen.cli import evaluate_command as evaluation
 from popgen.cli import experiment_commands as experiments
@@ -55,7 +56,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"popgen {popgen.__version__}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
-    subjects = (run, sweep, configuration, evaluation, population, ego, play, comparison, experiments, humans, bench)
-    for subject in subjects:
+    for subject in (
+        *(run, sweep, configuration, evaluation, population, ego, play, comparison),
+        *(experiments, humans, conventions, bench),
+    ):
         subject.add(commands)
     return parser

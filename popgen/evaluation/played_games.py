@@ -1,0 +1,84 @@
+"""Whole games by what each player did in them: of recorded people, and of the members of populations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from popgen.envs.overcooked.env import OvercookedEnv
+from popgen.envs.overcooked.transition_events import EVENTS, find_transition_events
+from popgen.errors import UserError
+from popgen.humans.behaviour import STEPS
+from popgen.humans.recordings import HumanGame, make_human_env
+from popgen.play.rollout import Transition, play
+from popgen.population.store import Population
+
+
+class PlayedGame(NamedTuple):
+    """One game of two players.
+
+    Attributes:
+        layout: its environment's name without the family.
+        participants: who answers for seat 0 and seat 1: games of one participant are not independent.
+        steps: of the game.
+        dishes: of the team.
+        counts: (2, len(EVENTS)) float64, each player's events.
+    """
+
+    layout: str
+    participants: tuple[str, str]
+    steps: int
+    dishes: float
+    counts: np.ndarray
+
+    @property
+    def rates(self) -> np.ndarray:
+        """(2, len(EVENTS)) events in 400 steps."""
+        return self.counts * (STEPS / self.steps)
+
+    @property
+    def dish_rate(self) -> float:
+        """Dishes in 400 steps."""
+        return self.dishes * STEPS / self.steps
+
+
+def count_people(games: Sequence[HumanGame]) -> list[PlayedGame]:
+    """Recorded games; the two people of a pair are one participant, since they only ever played with each other."""
+    envs = {layout: make_human_env(layout) for layout in {game.layout for game in games}}
+    played = []
+    for game in games:
+        counts = find_transition_events(envs[game.layout], game.states[:-1], game.actions).sum(0, dtype=np.float64)
+        pair = f"{game.half} pair {game.pair}"
+        played.append(PlayedGame(game.layout, (pair, pair), game.steps, float(game.dishes.sum()), counts))
+    return played
+
+
+def count_members(population: Population, episodes: int, seed: int) -> list[PlayedGame]:
+    """Games of every member with itself: what it does beside a partner that shares its conventions.
+
+    Raises:
+        UserError: the population does not play Overcooked, or has no members.
+    """
+    size = len(population)
+    if not size:
+        raise UserError("population", f"{population.path} has no members yet", "train one first")
+    seats = np.repeat(np.arange(size), episodes)[:, None].repeat(2, 1)
+    env = population.make_env(len(seats))
+    if not isinstance(env, OvercookedEnv):
+        raise UserError("population", f"{population.path} plays {env.spec.name}, not Overcooked", "give another one")
+    counts, steps = np.zeros((len(seats), 2, len(EVENTS))), np.zeros(len(seats), np.int64)
+
+    def count(step: Transition) -> None:
+        counts[...] += find_transition_events(env, step.states, step.actions) * step.counted[:, None, None]
+        steps[...] += step.counted
+
+    members = [population[member] for member in range(1, size + 1)]
+    result = play(env, members, seats, seed=seed, record=count)
+    layout = env.spec.name.rpartition("/")[2]
+    names = [f"member {member + 1}" for member in seats[:, 0]]
+    return [
+        PlayedGame(layout, (names[row], names[row]), int(steps[row]), float(result.score[row]), counts[row])
+        for row in range(len(seats))
+    ]
