@@ -10,6 +10,7 @@ _LAZY = {
     "evaluate_population": "popgen.evaluation.crossplay",
     "load_population": "popgen.population",
     "make_env": "popgen.envs",
+    "make_partner_env": "popgen.population.partner_env",
     "recipe": "popgen.methods.registry",
 }
 __all__ = ["__version__", *_LAZY]  # pyright: ignore[reportUnsupportedDunderAll] (`__getattr__` has them)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from popgen.cli.arguments import Parser, add_command, at_least, numbers, positive
 from popgen.cli.compose import compose
 from popgen.cli.printing import OK, print_json, print_table
-from popgen.cli.training import before_ray
+from popgen.cli.training import before_ray, bound_threads
+from popgen.errors import UserError
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
@@ -19,7 +20,7 @@ C = TypeVar("C", bound="RunConfig")
 
 
 def add(commands: Any) -> None:
-    """`bench env`, `bench mappo`, `bench world-model` and `bench scale`."""
+    """`bench env`, `bench mappo`, `bench ego`, `bench world-model` and `bench scale`."""
     bench = commands.add_parser("bench", help="measure speed", description="Measure speed.")
     kinds = bench.add_subparsers(title="what to measure", metavar="WHAT", required=True, parser_class=Parser)
     env = add_command(
@@ -54,6 +55,17 @@ def add(commands: Any) -> None:
     learners.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
     learners.add_argument("--scales", default="laptop,paper", metavar="NAME,...", help="recipes (%(default)s)")
     learners.add_argument("--seconds", type=positive, default=10.0, help="time per measurement (%(default)s)")
+    ego = add_command(
+        kinds,
+        "ego",
+        bench_ego,
+        "an ego's training beside feed-forward and beside world-model partners, end to end",
+        "Keys of --json: env, method, threads, envs, partners, kinds (by kind of partner: steps, seconds, cpu_seconds, "
+        "steps_per_second, steps_per_cpu_second, rollout, the share of play).",
+    )
+    ego.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen ego train`")
+    ego.add_argument("--partners", type=at_least(1), default=8, help="of each kind (%(default)s)")
+    ego.add_argument("--seconds", type=positive, default=10.0, help="time per measurement (%(default)s)")
     scale = add_command(
         kinds,
         "scale",
@@ -94,6 +106,30 @@ def bench_mappo(args: argparse.Namespace) -> int:
         shares = ", ".join(f"{name} {share:.0%}" for name, share in result["shares"].items())
         print(f"{result['env']}: {result['steps_per_second']:,} environment steps a second end to end ({shares})")
         print(f"{result['steps_per_cpu_second']:,} a second of processor time, {result['threads']} threads")
+    return OK
+
+
+def bench_ego(args: argparse.Namespace) -> int:
+    """Environment steps a second of an ego's training."""
+    bound_threads(1)
+    from popgen.config.run_config import RunConfig
+    from popgen.methods.ego.config import EgoRun, FcpRun
+
+    words = [f"method={FcpRun.model_fields['method'].default}", "cluster.threads=2", *args.overrides]
+    config = RunConfig.parse(compose(words))
+    if not isinstance(config, EgoRun) or config.plays_itself:
+        raise UserError("method", f"{config.method} has no partners", "choose ego_fcp or hipt")
+    from popgen.pipelines.bench_ego import bench_ego as measure
+
+    result = measure(config, seconds=args.seconds, partners=args.partners)
+    if args.json:
+        print_json(result)
+        return OK
+    for kind, row in result["kinds"].items():
+        rates = f"{row['steps_per_second']:,} environment steps a second ({row['steps_per_cpu_second']:,} of processor"
+        print(
+            f"{result['env']}, {result['partners']} partners of kind {kind}: {rates} time), play {row['rollout']:.0%}"
+        )
     return OK
 
 

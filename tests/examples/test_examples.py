@@ -17,6 +17,7 @@ SAYS = {
     "measure_population.py": ["<Population of 2 members", "seat_1", "member 2 beside a random partner: <5 episodes"],
     "partner_for_an_agent.py": ["episode 0: ", "episode 1: ", "score"],
     "kitchen_of_ones_own.py": ["<OvercookedEnv overcooked/alcove: 8 environments", "dishes of random play"],
+    "train_an_ego_with_sb3.py": ["points of training reward an episode"],
 }
 
 

@@ -177,8 +177,7 @@ class EgoLearner:
         """
         self.net.eval()
         rollout = self.sampler.play()
-        figures = self._learn(rollout)
-        self.steps += rollout.steps
+        figures = self.learn(rollout)
         return Iterated(figures, rollout.steps, rollout.episodes)
 
     # ---- targets -------------------------------------------------------------------------------------------------
@@ -231,8 +230,8 @@ class EgoLearner:
 
     # ---- updates -------------------------------------------------------------------------------------------------
 
-    def _learn(self, rollout: Rollout) -> dict[str, float]:
-        """Several epochs of minibatches of whole sequences."""
+    def learn(self, rollout: Rollout) -> dict[str, float]:
+        """Several epochs of minibatches of whole sequences; their mean figures."""
         config, figures = self.config, {}
         low = self._aim_low(rollout)
         high = None if rollout.choices is None else self._aim_high(rollout, rollout.choices, figures)
@@ -247,6 +246,7 @@ class EgoLearner:
                 for name, value in self._update({name: part[:, index] for name, part in batch.items()}).items():
                     totals[name].append(value)
         figures |= {name: float(np.mean(values)) for name, values in totals.items()}
+        self.steps += rollout.steps
         return figures | {"learning_rate": rate}
 
     def _update(self, batch: dict[str, Tensor]) -> dict[str, float]:
