@@ -55,17 +55,7 @@ def add(commands: Any) -> None:
     learners.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
     learners.add_argument("--scales", default="laptop,paper", metavar="NAME,...", help="recipes (%(default)s)")
     learners.add_argument("--seconds", type=positive, default=10.0, help="time per measurement (%(default)s)")
-    ego = add_command(
-        kinds,
-        "ego",
-        bench_ego,
-        "an ego's training beside feed-forward and beside world-model partners, end to end",
-        "Keys of --json: env, method, threads, envs, partners, kinds (by kind of partner: steps, seconds, cpu_seconds, "
-        "steps_per_second, steps_per_cpu_second, rollout, the share of play).",
-    )
-    ego.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen ego train`")
-    ego.add_argument("--partners", type=at_least(1), default=8, help="of each kind (%(default)s)")
-    ego.add_argument("--seconds", type=positive, default=10.0, help="time per measurement (%(default)s)")
+    _add_ego(kinds)
     scale = add_command(
         kinds,
         "scale",
@@ -77,6 +67,20 @@ def add(commands: Any) -> None:
     scale.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen run`")
     scale.add_argument("--samplers", type=numbers, default=[1, 2, 4], metavar="1,2,...", help="how many (1,2,4)")
     scale.add_argument("--seconds", type=positive, default=30.0, help="time per measurement (%(default)s)")
+
+
+def _add_ego(kinds: Any) -> None:
+    ego = add_command(
+        kinds,
+        "ego",
+        bench_ego,
+        "an ego's training beside feed-forward and beside world-model partners, end to end",
+        "Keys of --json: env, method, threads, envs, partners, kinds (by kind of partner: steps, seconds, cpu_seconds, "
+        "steps_per_second, steps_per_cpu_second, rollout, the share of play).",
+    )
+    ego.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for `popgen ego train`")
+    ego.add_argument("--partners", type=at_least(1), default=8, help="of each kind (%(default)s)")
+    ego.add_argument("--seconds", type=positive, default=10.0, help="time per measurement (%(default)s)")
 
 
 def bench_env(args: argparse.Namespace) -> int:

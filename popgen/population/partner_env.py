@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,16 @@ from popgen.errors import UserError
 from popgen.population.store import Population, check_compatible, load_population
 
 REWARDS = ("events", "environment")
+
+
+class SeatStep(NamedTuple):
+    """What Gymnasium's `step` gives, in its order."""
+
+    observation: np.ndarray
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
 
 
 class PartnerEnv(gymnasium.Env[np.ndarray, int]):
@@ -88,7 +98,7 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
         self._previous[:], self._first[:] = 0, True
         return self._look(), self._tell(0.0)
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> SeatStep:
         """The agent's action beside its partner's."""
         partner = self._partners[self._partner]
         joint = partner.act(self._env.observe(partner.view), self._previous, self._first).copy()
@@ -97,7 +107,7 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
         self._previous, self._first = joint, np.zeros(1, bool)
         paid = training_reward(self._env.spec, result) if self._reward == "events" else result.reward
         ends = bool(result.terminated[0]), bool(result.truncated[0])
-        return self._look(), float(paid[0]), *ends, self._tell(float(result.score[0]))
+        return SeatStep(self._look(), float(paid[0]), *ends, self._tell(float(result.score[0])))
 
     def render(self) -> np.ndarray | None:
         """A picture (H, W, 3) uint8; None without a render mode."""
