@@ -2,13 +2,13 @@
 
 A group is one name: an ego with its seeds, or the partners of one kind. A player is one policy of a group. An ego is an
 ordinary population folder; what it was trained beside stands in the record of its members under `trained_with`: a list
-of objects, one for each partner, with the keys method, population_seed, config_digest and policy_sha256 among others.
+of objects, one for each population, with the keys method, seed, config_digest and policy_sha256 (a list) among others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -173,17 +173,21 @@ def _open_member(population: Population, member: int) -> Callable[[], Policy]:
 
 
 def read_partners(place: str, extra: Mapping[str, Any]) -> list[Lineage]:
-    """Lineages of the members that a member was trained with, by its record, one for each population.
+    """Lineages of the populations that a member was trained with, by its record.
 
     Raises:
         UserError: the record holds something else.
     """
-    met: dict[Lineage, set[str]] = {}
     try:
-        for one in extra.get(TRAINED_WITH) or []:
-            source = Lineage(str(one["method"]), int(one["population_seed"]), str(one["config_digest"]))
-            met.setdefault(source, set()).add(str(one["policy_sha256"]))
-        return [replace(source, digests=frozenset(digests) - {NO_WEIGHTS}) for source, digests in met.items()]
+        return [
+            Lineage(
+                method=str(one["method"]),
+                seed=int(one["seed"]),
+                config_digest=str(one["config_digest"]),
+                digests=frozenset(map(str, one["policy_sha256"])) - {NO_WEIGHTS},
+            )
+            for one in extra.get(TRAINED_WITH) or []
+        ]
     except (KeyError, TypeError, ValueError, AttributeError):
         raise UserError(place, f"{TRAINED_WITH} of a member cannot be read", "restore it from a good copy") from None
 
