@@ -8,7 +8,9 @@ from typing import Any
 
 from popgen.config.run_config import RunConfig
 from popgen.config.sections import TrackingConfig
+from popgen.evaluation.held_members import HeldScores, hold_members
 from popgen.pipelines.run_batch import run_all
+from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.reports.comparison import Group, costs, group_runs, quality_costs
 from popgen.reports.comparison_report import Comparison, chosen_thresholds, to_dict, write_report
@@ -18,15 +20,19 @@ from popgen.runs.mlflow_tracker import Tracker
 EXPERIMENT = "popgen-compare"
 """Name of the MLflow experiment that comparisons go to."""
 
+HELD_SEED = 20_000
+"""Of held evaluations; no run is trained or evaluated with it by default."""
+
 
 def compare_runs(
     runs: Sequence[tuple[str | None, str | Path]],
     starts: Sequence[tuple[str | None, RunConfig]],
     out: str | Path,
     *,
-    agents: int,
+    agents: int | None,
     sp: float | None,
     xp: float | None,
+    episodes: int,
     tracking: TrackingConfig,
     reporter: Reporter,
 ) -> dict[str, Any]:
@@ -36,8 +42,9 @@ def compare_runs(
         runs: (label or None for the method, folder).
         starts: (label or None, run to start), see `popgen.pipelines.run_batch`; finished ones are not started again.
         out: folder of the report and, without another URI, of `mlflow.db`.
-        agents: M up to which costs are extrapolated.
+        agents: M up to which costs are extrapolated; None for costs as measured.
         sp, xp: thresholds of equal quality; None takes the defaults.
+        episodes: of the held evaluation of every run, for each member alone and for each pair and seating.
         tracking: of the MLflow runs of this comparison.
         reporter: told of progress.
 
@@ -54,10 +61,26 @@ def compare_runs(
     folders = run_all([config for _, config in starts], reporter=reporter)
     started = [read_run(folder, label) for folder, (label, _) in zip(folders, starts, strict=True)]
     groups = group_runs(records + started)
-    comparison = Comparison(tuple(groups), agents, chosen_thresholds(groups, sp, xp))
+    thresholds = chosen_thresholds(groups, sp, xp)
+    held = hold_runs(groups, list(thresholds), episodes, reporter)
+    comparison = Comparison(tuple(groups), agents, thresholds, held)
     files = write_report(comparison, out)
     log_comparison(comparison, files, Path(out), tracking)
     return to_dict(comparison) | {"files": {name: str(path) for name, path in files.items()}}
+
+
+def hold_runs(
+    groups: Sequence[Group], environments: Sequence[str], episodes: int, reporter: Reporter
+) -> dict[str, HeldScores]:
+    """Held evaluations of all runs on some environments, with one seed and equally many episodes: folder -> scores."""
+    runs = [run for group in groups if group.environment in environments for run in group.runs]
+    if runs:
+        reporter.phase("held evaluation", len(runs))
+    found = {}
+    for number, run in enumerate(runs, start=1):
+        found[str(run.path)] = hold_members(load_population(run.path / "population"), episodes, HELD_SEED)
+        reporter.update(number, run=run.run_id)
+    return found
 
 
 def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path, tracking: TrackingConfig) -> None:
@@ -70,7 +93,8 @@ def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path,
             for agents, figures in points(comparison, group, run).items():
                 tracker.log(figures, step=agents)
             tracker.finish()
-    tracker = Tracker(tracking, out, "comparison", {"agents": comparison.agents, "runs": len(_list_runs(comparison))})
+    described = {"agents": comparison.agents or 0, "runs": len(_list_runs(comparison))}
+    tracker = Tracker(tracking, out, "comparison", described)
     for path in files.values():
         tracker.log_artifact(path, "comparison")
     tracker.finish()
@@ -87,8 +111,9 @@ def points(comparison: Comparison, group: Group, run: RunRecord) -> dict[int, di
             figures[f"seconds_{end}"] = cost.seconds
         found[cost.agents] = figures
     limits = comparison.thresholds.get(group.environment)
-    if limits is not None and any(member.curve for member in run.members):
-        for many in quality_costs(run, limits):
+    held = comparison.held.get(str(run.path))
+    if limits is not None and held is not None:
+        for many in quality_costs(run, limits, held):
             end = "_lower_bound" if many.bound else ""
             found[many.agents][f"steps_to_quality_by_members{end}"] = float(many.steps)
     return found

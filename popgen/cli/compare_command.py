@@ -35,7 +35,9 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="for every --start whose method has it"
     )
-    parser.add_argument("--agents", type=at_least(1), default=8, help="extrapolate costs to this many (%(default)s)")
+    parser.add_argument("--agents", type=at_least(1), default=None, help="extrapolate costs that grow to this many")
+    told = "of the held evaluation, for each member and for each pair and seating (%(default)s)"
+    parser.add_argument("--episodes", type=at_least(1), default=20, help=told)
     for name, which in (("--sp", "SP of at least"), ("--xp", "XP of at most")):
         told = f"equal quality: {which} this (0.8 and 0.2 of the SP of the paper's XPM-WM on the layout)"
         parser.add_argument(name, type=finite, default=None, metavar="SCORE", help=told)
@@ -62,6 +64,7 @@ def compare(args: argparse.Namespace) -> int:
         report = compare_runs(
             *(args.runs, list(zip(labels, configs, strict=True)), args.out),
             agents=args.agents,
+            episodes=args.episodes,
             sp=args.sp,
             xp=args.xp,
             tracking=tracking,

@@ -1,10 +1,15 @@
 """Runs of several methods beside each other: cost against the number of agents, scores, and steps to equal quality.
 
 A group is one label (a method, unless runs were given names) in one environment; its runs differ in their seeds only.
-Cost after M agents is the sum over members 1..M. Beyond a run's own size it is extrapolated, kind by kind: a straight
-line through the cost of members 2, 3, ... by least squares (never below 0), or the cost of member 2 where it is the
-only later one; its time is that many real and simulated steps at the speed of the later members. Real steps, steps of
-an exact simulator used as dynamics model, and those of evaluations are three figures.
+Cost after M agents is the sum over members 1..M, as measured. Beyond a run's own size it is extrapolated only if asked
+for, and only where at least three later members were measured and cost more and more: kind by kind, a straight line
+through members 2, 3, ... by least squares; its time is that many real and simulated steps at the speed of the later
+members. Nothing is extrapolated flat. Real steps, steps of an exact simulator used as dynamics model, and those of
+evaluations are three figures.
+
+Equal quality is judged by held evaluations of finished members (`popgen.evaluation.held_members`), with as many
+episodes for every method. Its cost is what had been taken in all when the member was finished, with everything that it
+builds on: all earlier members, or all members where they learn together.
 """
 
 from __future__ import annotations
@@ -16,13 +21,17 @@ from itertools import accumulate
 import numpy as np
 
 from popgen.errors import UserError
+from popgen.evaluation.estimates import Estimate
+from popgen.evaluation.held_members import HeldMember, HeldScores
 from popgen.reports import paper_figures as paper
 from popgen.reports.method_titles import METHODS, name_of, title_of
 from popgen.reports.run_record import REAL, MemberRecord, RunRecord, differences
 from popgen.types import Kind
 
 KINDS = (*(str(kind) for kind in REAL), str(Kind.SIMULATED))
-MEASURED, LINE, CONSTANT = "measured", "line through members 2 and up", "cost of member 2 held"
+MEASURED, LINE = "measured", "line through members 2 and up"
+LEAST_LATER = 3
+"""Later members without which no line is drawn beyond the last."""
 SHARE_SP, SHARE_XP = 0.8, 0.2
 """Default thresholds of equal quality, as shares of the self-play score of the paper's XPM-WM on the layout."""
 
@@ -61,7 +70,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Equal quality: real self-play of at least `sp` while the strongest real cross-play is at most `xp`."""
+    """Equal quality: self-play of at least `sp` while cross-play with the strongest partner is at most `xp`."""
 
     sp: float
     xp: float
@@ -69,21 +78,27 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Quality:
-    """When a member was first good enough.
+    """Whether a finished member is good enough, and what it took to have it.
 
     Attributes:
         member: from 1.
-        steps: its own real steps until then; None where that never happened, or nothing is known of it.
-        simulated: its own simulated steps until then, or in all; no part of `steps`.
-        spent: its real steps in all.
-        known: whether its learning curve was kept.
+        passed: by a held evaluation of its policy; None where there was none.
+        sp, xp: of that evaluation; `xp` with the strongest earlier member, None for the first.
+        taken: real steps in all when it was finished, of everything that it builds on.
+        simulated: the same of simulated steps; no part of `taken`.
+        spent: its own real steps.
+        window: as `taken`, when a window of training first showed both thresholds passed, by whatever policy played in
+            it; None where none did. No evidence of a policy's quality.
     """
 
     member: int
-    steps: int | None
+    passed: bool | None
+    sp: Estimate | None
+    xp: Estimate | None
+    taken: int
     simulated: int
     spent: int
-    known: bool
+    window: int | None
 
 
 @dataclass(frozen=True)
@@ -165,33 +180,36 @@ def _shorten(value: object) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
-def costs(run: RunRecord, agents: int) -> list[Cost]:
-    """Cumulative cost after 1, 2, ..., max(agents, members) agents; one agent alone is not extrapolated."""
+def costs(run: RunRecord, agents: int | None = None) -> list[Cost]:
+    """Cumulative cost after 1, 2, ... agents: of the members, and beyond them up to `agents` by the module's rule."""
     size = len(run.members)
-    total = max(agents, size) if size > 1 else size
+    total = max(agents or size, size) if _grows(run) else size
     steps = {kind: _sum_up([m.steps.get(kind, 0) for m in run.members], total) for kind in KINDS}
-    seconds, rule = _sum_seconds(run, steps, total), LINE if size > 2 else CONSTANT
+    seconds = _sum_seconds(run, steps, total)
     return [
         Cost(
             agents=m,
             steps={kind: steps[kind][m - 1] for kind in KINDS},
             seconds=None if seconds is None else seconds[m - 1],
-            rule=MEASURED if m <= size else rule,
+            rule=MEASURED if m <= size else LINE,
         )
         for m in range(1, total + 1)
     ]
 
 
+def _grows(run: RunRecord) -> bool:
+    """Whether enough later members were measured, and the line through their cost rises."""
+    later = [sum(m.steps.get(kind, 0) for kind in KINDS) for m in run.members[1:]]
+    return len(later) >= LEAST_LATER and float(np.polyfit(np.arange(len(later)), later, 1)[0]) > 1e-9 * max(later)
+
+
 def _sum_up(values: Sequence[float], total: int) -> list[float]:
-    """Sums after each member, carried on to `total` members by the module's rule."""
+    """Sums after each member, carried on to `total` members in a straight line through the later ones."""
     size = len(values)
     members = list(map(float, values))
-    later = np.arange(2, size + 1)
-    if size > 2:
-        slope, level = np.polyfit(later, members[1:], 1)
+    if total > size:
+        slope, level = np.polyfit(np.arange(2, size + 1), members[1:], 1)
         members += [max(0.0, float(level + slope * m)) for m in range(size + 1, total + 1)]
-    elif size == 2:
-        members += [members[1]] * (total - size)
     return list(accumulate(members))
 
 
@@ -219,28 +237,54 @@ def default_thresholds(environment: str) -> Thresholds | None:
     return None if scores is None else Thresholds(round(SHARE_SP * scores.sp, 2), round(SHARE_XP * scores.sp, 2))
 
 
-def quality(member: MemberRecord, thresholds: Thresholds) -> Quality:
-    """The first point of real play at which a member passed both thresholds.
+def judge_members(run: RunRecord, thresholds: Thresholds, held: HeldScores | None) -> list[Quality]:
+    """Each member's quality and cost; without a held evaluation nobody is known to have passed."""
+    together = run.settings.get("diversity.order") == "concurrent"
+    found, before, simulated = [], 0, 0
+    everything = sum(member.real for member in run.members)
+    everything_simulated = sum(member.steps.get(str(Kind.SIMULATED), 0) for member in run.members)
+    for number, member in enumerate(run.members):
+        one = held.members[number] if held is not None else None
+        simulated += member.steps.get(str(Kind.SIMULATED), 0)
+        window = _find_window(member, thresholds)
+        found.append(
+            Quality(
+                member=member.member,
+                passed=None if one is None else _passes(one, thresholds),
+                sp=None if one is None else one.sp,
+                xp=None if one is None else one.xp,
+                taken=everything if together else before + member.real,
+                simulated=everything_simulated if together else simulated,
+                spent=member.real,
+                window=None if window is None else before + window,
+            )
+        )
+        before += member.real
+    return found
 
-    Where no cross-play was measured, a first member passes (it has no partner) and a later one does not.
-    """
+
+def _passes(one: HeldMember, thresholds: Thresholds) -> bool:
+    return one.sp.mean >= thresholds.sp and (one.xp is None or one.xp.mean <= thresholds.xp)
+
+
+def _find_window(member: MemberRecord, thresholds: Thresholds) -> int | None:
+    """A member's own steps when training first showed both thresholds passed; a later member needs cross-play."""
     for point in member.curve:
         apart = member.member == 1 if point.xp is None else point.xp <= thresholds.xp
         if point.sp >= thresholds.sp and apart:
-            return Quality(member.member, point.step, point.simulated, member.real, True)
-    simulated = member.steps.get(str(Kind.SIMULATED), 0)
-    return Quality(member.member, None, simulated, member.real, bool(member.curve))
+            return point.step
+    return None
 
 
 @dataclass(frozen=True)
 class QualityCost:
-    """Real steps until each of the first M members was good enough.
+    """Real steps taken in all when member M had passed.
 
     Attributes:
         agents: M.
-        steps: sum over members; those that never were count with all they took.
+        steps: with everything that the first M members build on.
         simulated: the same of simulated steps.
-        reached: how many were.
+        reached: how many of the first M passed.
     """
 
     agents: int
@@ -250,18 +294,16 @@ class QualityCost:
 
     @property
     def bound(self) -> bool:
-        """Some never were, so that the true figure is above `steps`."""
+        """Some did not pass, so that the true figure is above `steps`."""
         return self.reached < self.agents
 
 
-def quality_costs(run: RunRecord, thresholds: Thresholds) -> list[QualityCost]:
+def quality_costs(run: RunRecord, thresholds: Thresholds, held: HeldScores | None) -> list[QualityCost]:
     """After 1, 2, ..., M members of the run."""
-    found = [quality(member, thresholds) for member in run.members]
-    sums = accumulate(one.spent if one.steps is None else one.steps for one in found)
-    simulated = accumulate(one.simulated for one in found)
-    reached = accumulate(int(one.steps is not None) for one in found)
-    rows = zip(range(1, len(found) + 1), sums, simulated, reached, strict=True)
-    return [QualityCost(*row) for row in rows]
+    found = judge_members(run, thresholds, held)
+    reached = accumulate(int(bool(one.passed)) for one in found)
+    pairs = zip(found, reached, strict=True)
+    return [QualityCost(one.member, one.taken, one.simulated, count) for one, count in pairs]
 
 
 @dataclass(frozen=True)
@@ -345,7 +387,7 @@ class Band:
         )
 
 
-def step_band(group: Group, agents: int, kind: str | None = None) -> Band:
+def step_band(group: Group, agents: int | None, kind: str | None = None) -> Band:
     """Environment steps against M: real ones of all kinds, or of one kind."""
     rows = []
     for run in group.runs:
@@ -354,14 +396,15 @@ def step_band(group: Group, agents: int, kind: str | None = None) -> Band:
     return Band.over(rows)
 
 
-def time_band(group: Group, agents: int) -> Band:
+def time_band(group: Group, agents: int | None) -> Band:
     """Seconds of training against M."""
     return Band.over([[(c.agents, c.seconds, c.measured) for c in costs(run, agents)] for run in group.runs])
 
 
-def quality_band(group: Group, thresholds: Thresholds) -> Band:
-    """Real steps to equal quality against M; `measured` is False where a member never got there (a lower bound)."""
+def quality_band(group: Group, thresholds: Thresholds, held: Mapping[str, HeldScores]) -> Band:
+    """Real steps to equal quality against M; `measured` is False where a member did not pass (a lower bound)."""
     rows = []
     for run in group.runs:
-        rows.append([(q.agents, float(q.steps), not q.bound) for q in quality_costs(run, thresholds)])
+        found = quality_costs(run, thresholds, held.get(str(run.path)))
+        rows.append([(q.agents, float(q.steps), not q.bound) for q in found])
     return Band.over(rows)

@@ -22,6 +22,9 @@ CRAMPED, ASYMMETRIC, RING, FORCED, CIRCUIT, RENDEZVOUS = (
     "rendezvous/mppmr",
 )
 
+AGENTS = 8
+"""Of the paper's populations."""
+
 LAYOUT_NAMES = {
     CRAMPED: "Cramped Room",
     ASYMMETRIC: "Asymmetric Advantages",

@@ -192,16 +192,19 @@ def _read_config(path: Path) -> dict[str, Any]:
     return values
 
 
+def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted names -> values."""
+    found: dict[str, Any] = {}
+    for name, value in config.items():
+        inner = isinstance(value, Mapping)
+        found |= flatten_settings(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value}
+    return found
+
+
 def _decisive_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Everything that decides the result, flat; the environment is compared by its fingerprint."""
-
-    def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, value in values.items():
-            found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-        return found
-
-    return {name: value for name, value in flat(config).items() if not name.startswith((*_FREE, "env."))}
+    settings = flatten_settings(config)
+    return {name: value for name, value in settings.items() if not name.startswith((*_FREE, "env."))}
 
 
 def _read_scores(path: Path, fix: str) -> dict[str, Any]:

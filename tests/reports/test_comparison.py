@@ -13,11 +13,12 @@ from matplotlib.image import imread
 from support.finished import CRAMPED, finished_run
 
 from popgen.errors import UserError
+from popgen.evaluation.estimates import Estimate
+from popgen.evaluation.held_members import HeldMember, HeldScores, hold_members
 from popgen.reports import comparison_report
 from popgen.reports import paper_figures as paper
 from popgen.reports.charts.scaling_charts import choose_looks
 from popgen.reports.comparison import (
-    CONSTANT,
     LINE,
     MEASURED,
     Band,
@@ -27,7 +28,7 @@ from popgen.reports.comparison import (
     costs,
     default_thresholds,
     group_runs,
-    quality,
+    judge_members,
     quality_costs,
     step_band,
     time_band,
@@ -166,28 +167,27 @@ def test_costs_are_sums_and_go_on_in_a_line(model: RunRecord) -> None:
     assert [c.seconds for c in found] == pytest.approx([500, 555, 615, 680, 750, 825])
 
 
-def test_one_later_member_is_held_and_one_member_is_not_extrapolated(exact: RunRecord, tmp_path: Path) -> None:
-    found = costs(exact, 4)
-    assert [c.real for c in found] == [80, 160, 240, 320] and found[3].rule == CONSTANT
-    assert [c.simulated for c in found] == [5000, 12_000, 19_000, 26_000]
-    assert [c.seconds for c in found] == [60, 120, 180, 240]
-    alone = read_run(finished_run(tmp_path, "alone", [{"SP": 5}], method="mappo", seconds=[None]))
-    assert [(c.agents, c.real, c.seconds) for c in costs(alone, 8)] == [(1, 5, None)]
-
-
-def test_extrapolated_members_never_cost_less_than_nothing(tmp_path: Path) -> None:
-    run = read_run(finished_run(tmp_path, "falling", [{"SP": 100}, {"SP": 100}, {"SP": 40}]))
-    assert [c.real for c in costs(run, 6)] == pytest.approx([100, 200, 240, 240, 240, 240])
+def test_nothing_is_extrapolated_flat(exact: RunRecord, tmp_path: Path) -> None:
+    """Fidelity review, minor findings: a flat line from members 2 and 3 told 358,400 steps where 396,800 were taken."""
+    assert [(c.agents, c.real, c.simulated, c.seconds) for c in costs(exact, 4)] == [
+        (1, 80, 5000, 60),
+        (2, 160, 12_000, 120),
+    ]
+    few = read_run(finished_run(tmp_path, "few", [{"SP": 9}, {"SP": 100}, {"SP": 200}], seed=5))
+    flat = read_run(finished_run(tmp_path, "flat", [{"SP": 100}, *[{"SP": 50, "XP": 10}] * 3], seed=6))
+    falling = read_run(finished_run(tmp_path, "falling", [{"SP": 100}, {"SP": 100}, {"SP": 40}, {"SP": 20}], seed=7))
+    assert [len(costs(run, 8)) for run in (few, flat, falling)] == [3, 4, 4]
+    assert [c.rule for c in costs(flat, 8)] == [MEASURED] * 4
 
 
 def test_bands_are_over_seeds_and_as_long_as_all_of_them(model: RunRecord, tmp_path: Path) -> None:
     other = read_run(finished_run(tmp_path, "seed1", [{"SP": 2000}, {"SP": 200}], seed=1, seconds=[10.0, None]))
     group = Group("xpm_wm", "xpm_wm", CRAMPED, (model, other))
     band = step_band(group, 3)
-    assert band.agents.tolist() == [1, 2, 3] and band.mean.tolist() == pytest.approx([1500, 1655, 1815])
-    assert band.low.tolist() == pytest.approx([1000, 1110, 1230])
-    assert band.high.tolist() == pytest.approx([2000, 2200, 2400])
-    assert band.measured.tolist() == [True, True, False]
+    assert band.agents.tolist() == [1, 2] and band.mean.tolist() == pytest.approx([1500, 1655])
+    assert band.low.tolist() == pytest.approx([1000, 1110])
+    assert band.high.tolist() == pytest.approx([2000, 2200])
+    assert band.measured.tolist() == [True, True]
     assert step_band(group, 3, "SP").mean[0] == 1200
     assert len(time_band(group, 3).agents) == 0
 
@@ -195,29 +195,74 @@ def test_bands_are_over_seeds_and_as_long_as_all_of_them(model: RunRecord, tmp_p
 # --- equal quality
 
 
-def test_quality_is_the_first_real_point_past_both_thresholds(model: RunRecord) -> None:
-    limits = Thresholds(8.0, 2.0)
-    found = [quality(member, limits) for member in model.members]
-    assert [(q.steps, q.spent, q.known) for q in found] == [
-        (600, 1000, True),
-        (80, 110, True),
-        (None, 120, True),
-        (None, 130, False),
+def held(*figures: tuple[float, float | None], episodes: int = 20) -> HeldScores:
+    """Held (SP, XP) of members 1, 2, ..."""
+    members = [
+        HeldMember(n, Estimate(sp, 0.1), None if xp is None else Estimate(xp, 0.1), None if xp is None else 1)
+        for n, (sp, xp) in enumerate(figures, start=1)
     ]
-    assert [(q.agents, q.steps, q.reached, q.bound) for q in quality_costs(model, limits)] == [
-        (1, 600, 1, False),
-        (2, 680, 2, False),
-        (3, 800, 2, True),
-        (4, 930, 2, True),
-    ]
-    assert quality(model.members[1], Thresholds(9.0, 5.0)).steps == 40
-    assert quality(model.members[2], Thresholds(8.0, 3.0)).steps == 120
+    return HeldScores(episodes, 0, 5000, tuple(members))
 
 
-def test_a_later_member_without_cross_play_has_not_passed(tmp_path: Path) -> None:
-    curves = {1: [(5, 9.0, None)], 2: [(5, 9.0, None)]}
-    run = read_run(finished_run(tmp_path, "blind", [{"SP": 9}, {"SP": 9}], curves=curves))
-    assert [quality(member, Thresholds(8.0, 2.0)).steps for member in run.members] == [5, None]
+LIMITS = Thresholds(8.0, 2.0)
+GOOD = held((9.0, None), (8.5, 1.0), (8.0, 2.0), (9.0, 0.0))
+
+
+def test_steps_to_quality_count_everything_that_a_member_is_built_on(model: RunRecord) -> None:
+    """Fidelity review, finding 3: member 2 uses the model and buffers of all of member 1's 1,000 steps, not of the 600
+    until its first passage."""
+    found = quality_costs(model, LIMITS, GOOD)
+    assert [(q.agents, q.steps, q.reached, q.bound) for q in found] == [
+        (1, 1000, 1, False),
+        (2, 1110, 2, False),
+        (3, 1230, 3, False),
+        (4, 1360, 4, False),
+    ]
+
+
+def test_a_window_of_training_passes_nobody(model: RunRecord) -> None:
+    """Fidelity review, finding 3: first passages are of noisy windows over several policies."""
+    poor = held((7.9, None), (8.5, 2.1), (9.0, 0.0), (1.0, 0.0))
+    judged = judge_members(model, LIMITS, poor)
+    assert [one.passed for one in judged] == [False, False, True, False]
+    assert [one.window for one in judged] == [600, 1000 + 80, None, None]
+    assert all(cost.bound for cost in quality_costs(model, LIMITS, poor))
+    unheld = judge_members(model, LIMITS, None)
+    assert [one.passed for one in unheld] == [None] * 4 and unheld[1].window == 1080
+    assert all(cost.reached == 0 for cost in quality_costs(model, LIMITS, None))
+
+
+def test_members_that_learn_together_build_on_each_other(tmp_path: Path) -> None:
+    settings = {"diversity": {"order": "concurrent"}}
+    run = read_run(finished_run(tmp_path, "both", [{"SP": 10}, {"SP": 10, "XP": 5}], method="lipo", settings=settings))
+    assert [cost.steps for cost in quality_costs(run, LIMITS, held((9.0, None), (9.0, 0.0)))] == [25, 25]
+
+
+def test_simulated_steps_of_predecessors_count_too(exact: RunRecord) -> None:
+    found = quality_costs(exact, LIMITS, held((9.0, None), (9.0, 0.0)))
+    assert [(cost.steps, cost.simulated) for cost in found] == [(80, 5000), (160, 12_000)]
+
+
+def test_a_held_evaluation_plays_every_policy_itself(random_population: Path) -> None:
+    from popgen.population import load_population
+
+    population = load_population(random_population)
+    scores = hold_members(population, 3, 1)
+    assert [(one.member, one.partner) for one in scores.members] == [(1, None), (2, 1)]
+    assert scores.members[0].xp is None and scores.members[1].xp is not None
+    assert scores.steps == (2 + 2) * 3 * 20 and scores == hold_members(population, 3, 1)
+    with pytest.raises(UserError, match="at least 1"):
+        hold_members(population, 0, 1)
+
+
+def test_the_strongest_partner_is_judged_over_both_seatings() -> None:
+    from support.scripted import ONE, STAY, TWO, Cast, Script
+
+    # A step of (2, 1) scores 1 + 0 in one seating and 10 in the other: mean 5.5; beside member 2 all is larger.
+    cast = Cast(Script([STAY]), Script([TWO]), Script([ONE]))
+    third = hold_members(cast, 2, 0).members[2]  # type: ignore[arg-type]
+    assert third.partner == 2 and third.xp is not None and third.xp.mean == 6 * (21 + 12) / 2
+    assert hold_members(cast, 2, 0).members[1].xp == Estimate(6 * (2 + 20) / 2, 0.0)  # type: ignore[arg-type]
 
 
 def test_thresholds_are_the_papers_or_the_users(model: RunRecord) -> None:
@@ -311,7 +356,9 @@ def comparison(model: RunRecord, exact: RunRecord, tmp_path_factory: pytest.Temp
     ring = finished_run(root, "ring", [{"SP": 70}, {"SP": 7}], method="lipo", env=RING)
     runs = [model, read_run(seed1), exact, read_run(comedi), read_run(ring)]
     groups = group_runs(runs)
-    return Comparison(tuple(groups), 8, chosen_thresholds(groups, 8.0, 2.0))
+    scores = {str(run.path): held((9.0, None), *[(8.5, 1.0)] * (len(run.members) - 1)) for run in runs}
+    scores[str(model.path)] = held((9.0, None), (8.5, 1.0), (5.0, 0.0), (9.0, 0.0))
+    return Comparison(tuple(groups), 8, chosen_thresholds(groups, 8.0, 2.0), scores)
 
 
 def test_json_holds_the_documented_keys(comparison: Comparison) -> None:
@@ -331,16 +378,22 @@ def test_json_holds_the_documented_keys(comparison: Comparison) -> None:
 def test_csv_marks_what_was_extrapolated(comparison: Comparison) -> None:
     told = comparison_report.to_dict(comparison)
     rows = list(csv.DictReader(io.StringIO(comparison_report.costs_csv(told))))
-    assert tuple(rows[0]) == comparison_report.COST_FIELDS and len(rows) == 5 * 8
+    assert tuple(rows[0]) == comparison_report.COST_FIELDS and len(rows) == 8 + 2 + 2 + 3 + 2
     found = {(row["environment"], row["run"], row["agents"]): row for row in rows}
     assert found[CRAMPED, "model", "4"]["measured"] == "1" and found[CRAMPED, "model", "5"]["measured"] == "0"
     assert found[CRAMPED, "model", "4"]["real_steps"] == "1360" and found[CRAMPED, "model", "5"]["rule"] == LINE
     assert found[CRAMPED, "exact", "2"]["simulated_steps"] == "12000"
     assert found[CRAMPED, "exact", "2"]["real_steps"] == "160"
-    assert found[CRAMPED, "comedi", "3"]["MP"] == "900" and found[CRAMPED, "comedi", "8"]["MP"] == "8400"
+    assert found[CRAMPED, "comedi", "3"]["MP"] == "900" and (CRAMPED, "comedi", "4") not in found
     good = list(csv.DictReader(io.StringIO(comparison_report.quality_csv(told))))
     assert tuple(good[0]) == comparison_report.QUALITY_FIELDS
-    assert [row["steps"] for row in good if row["run"] == "model"] == ["600", "80", "", ""]
+    told = [(row["passed"], row["taken"], row["window"], row["episodes"]) for row in good if row["run"] == "model"]
+    assert told == [
+        ("1", "1000", "600", "20"),
+        ("1", "1110", "1080", "20"),
+        ("0", "1230", "", "20"),
+        ("1", "1360", "", "20"),
+    ]
     budget = list(csv.DictReader(io.StringIO(comparison_report.budgets_csv(told))))
     assert tuple(budget[0]) == comparison_report.BUDGET_FIELDS and len(budget) == 8 + 4
 
@@ -349,11 +402,41 @@ def test_markdown_names_every_method_the_papers_rows_and_the_marks(comparison: C
     text = re.sub(" +", " ", comparison_report.to_markdown(comparison_report.to_dict(comparison)))
     assert "| overcooked/cramped_room | XPM-WM | 2 | 9.50 (9.00 to 10.00) |" in text
     assert "| overcooked/cramped_room | LIPO | 0 | - | - | - | - | - | 8.99 | 2.40 |" in text
-    assert "8* |" in text and "> 930" in text and "XPM-Sim" in text
+    assert "8* |" in text and "XPM-Sim" in text and "| no | 1,230 |" in text
     assert "Simulated steps" in text and "extrapolated" in text
     assert all(
         len(sheet.to_rich().columns) for sheet in comparison_report.to_sheets(comparison_report.to_dict(comparison))
     )
+
+
+def test_the_headline_is_at_as_many_agents_as_all_have(comparison: Comparison) -> None:
+    told = comparison_report.to_dict(comparison)
+    rows = {row["label"]: row for row in told["headline"] if row["environment"] == CRAMPED}
+    assert {row["agents"] for row in rows.values()} == {2}
+    assert rows["xpm_wm"]["steps"] == {"mean": 1215.0, "low": 1110.0, "high": 1320.0} and rows["xpm_wm"]["passed"] == 2
+    assert rows["xpm_sim"]["ratio"] == 1.0 and rows["comedi"]["ratio"] == pytest.approx(2400 / 160)
+    sheet = next(iter(comparison_report.to_sheets(told)))
+    assert "all that it builds on included" in sheet.title
+    assert any("held evaluation of its own policy: 20 episodes" in note for note in told["notes"])
+    run = next(run for run in told["runs"] if run["label"] == "xpm_sim")
+    assert run["held_steps"] == 5000 and run["real_steps"] == 160
+
+
+def test_the_options_of_every_method_are_told(tmp_path: Path) -> None:
+    """Fidelity review, finding 7: unlike recipes behind one column."""
+    from popgen.methods.registry import recipe
+
+    usual = {name: part for name, part in recipe("comedi", CRAMPED).as_dict().items() if isinstance(part, dict)}
+    settings = {name: part for name, part in usual.items() if name not in ("env", "population", "run")}
+    changed = {**settings, "diversity": {**settings["diversity"], "lambda_xp": 0.125}}
+    runs = [
+        read_run(finished_run(tmp_path, name, [{"SP": 1}], method="comedi", settings=own), name)
+        for name, own in (("usual", settings), ("changed", changed))
+    ]
+    groups = tuple(group_runs(runs))
+    told = {row["label"]: row for row in comparison_report.to_dict(Comparison(groups, None, {}))["options"]}
+    assert told["usual"]["given"] == {} and told["changed"]["given"] == {"diversity.lambda_xp": 0.125}
+    assert told["usual"]["cross_play"]["diversity.lambda_xp"] == usual["diversity"]["lambda_xp"]
 
 
 def test_charts_are_written_and_told_apart_without_colour(comparison: Comparison, tmp_path: Path) -> None:
@@ -364,10 +447,11 @@ def test_charts_are_written_and_told_apart_without_colour(comparison: Comparison
     }
     assert all(path.stat().st_size for path in files.values())
     svg = files["steps.svg"].read_text()
-    for text in ("number of agents M", "real environment steps", "extrapolated", "range over seeds", "XPM-Sim"):
+    for text in ("number of agents M", "real environment steps", "range over seeds", "XPM-Sim"):
         assert text in svg
     assert "simulated steps" in svg
-    assert "minutes of training" in files["time.svg"].read_text()
+    assert "minutes of training" in files["time.svg"].read_text() and "extrapolated" not in svg
+    assert "lower bound" not in files["quality.svg"].read_text()  # at two agents all have passed
     assert imread(files["steps.png"]).std() > 0.02
     again = tmp_path / "again"
     comparison_report.write_report(comparison, again)

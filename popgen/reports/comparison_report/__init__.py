@@ -3,17 +3,22 @@
 Keys of the JSON object (`comparison.json`); null stands for what is unknown:
 
     format, format_version   "popgen-comparison", 1
-    agents                   M up to which costs are extrapolated
+    agents                   M up to which costs are extrapolated, null for costs as measured
     runs                     label, method, environment, cooking, fingerprint, seed, scale, path, members, adopted,
-                             attempts, steps (by kind), real_steps, simulated_steps, evaluation_steps, lost_steps,
-                             seconds
+                             attempts, steps (by kind), real_steps, simulated_steps, evaluation_steps,
+                             held_episodes, held_steps (of the evaluation made for this), lost_steps, seconds
     costs                    one per run and M: label, environment, seed, agents, measured, rule, steps (by kind,
                              cumulative), real_steps, simulated_steps, seconds
     scores                   one per label and environment: seeds, sp and xp (mean, low, high over seeds), gap, beside
                              (random, idle), paper (sp, xp or null)
+    headline                 one per label and environment: agents (M), runs, passed (runs whose first M agents all
+                             passed), steps (mean, low, high of the real steps taken in all by then), simulated, ratio
+                             (over the label with the fewest of those whose runs all passed)
     quality                  thresholds (environment -> sp, xp or null), members (label, environment, seed, member,
-                             steps or null, simulated, spent, known), agents (label, environment, seed, agents,
-                             steps, simulated, reached, lower_bound)
+                             passed or null, sp, xp, taken, simulated, spent, window), agents (label, environment,
+                             seed, agents, steps, simulated, reached, lower_bound)
+    options                  one per label and environment: given (settings that are not the recipe's), cross_play (all
+                             that decide how cross-play is pressed down)
     paper                    environment -> method -> sp, xp: all that the paper has on these environments
     budgets                  both readings of the baselines' budget: source (`paper` or a run), method, environment,
                              agents, reading, budget, steps (by kind), total, ratio (over the paper's XPM-WM)

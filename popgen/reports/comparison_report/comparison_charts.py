@@ -69,10 +69,10 @@ def _time_panels(comparison: Comparison) -> list[Panel]:
 def _quality_panels(comparison: Comparison) -> list[Panel]:
     panels = []
     for name, limits in comparison.thresholds.items():
-        groups = [g for g in _groups_on(comparison, name) if any(m.curve for run in g.runs for m in run.members)]
-        lines = [Line(g.label, _name_with_seeds(g), quality_band(g, limits)) for g in groups]
+        groups = [g for g in _groups_on(comparison, name) if all(str(run.path) in comparison.held for run in g.runs)]
+        lines = [Line(g.label, _name_with_seeds(g), quality_band(g, limits, comparison.held)) for g in groups]
         title = f"{short_name(name)}: SP ≥ {limits.sp:g}, XP ≤ {limits.xp:g}"
-        panels.append(Panel(title, "real steps to equal quality", lines))
+        panels.append(Panel(title, "real steps taken when agent M had passed", lines))
     return panels
 
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from popgen.errors import UserError
+from popgen.evaluation.estimates import Estimate
+from popgen.evaluation.held_members import HeldScores
+from popgen.methods.registry import recipe
 from popgen.reports import paper_figures as paper
 from popgen.reports.comparison import (
     KINDS,
+    LINE,
     Budget,
     Group,
+    Quality,
     Thresholds,
     budgets,
     costs,
     default_thresholds,
-    quality,
+    judge_members,
     quality_costs,
 )
 from popgen.reports.frames import spread_of
 from popgen.reports.method_titles import name_of, title_of
-from popgen.reports.run_record import REAL, RunRecord
+from popgen.reports.run_record import REAL, RunRecord, flatten_settings
 from popgen.types import Kind
 
 
@@ -31,13 +36,20 @@ class Comparison:
 
     Attributes:
         groups: from `group_runs`.
-        agents: costs are carried on to this many.
+        agents: costs are carried on to this many where that can be; None for costs as measured.
         thresholds: of equal quality by environment; an environment without is left out of it.
+        held: folder of a run -> held evaluation of its members.
     """
 
     groups: tuple[Group, ...]
-    agents: int
+    agents: int | None
     thresholds: Mapping[str, Thresholds]
+    held: Mapping[str, HeldScores] = field(default_factory=dict)
+
+    @property
+    def budget_agents(self) -> int:
+        """Agents for which the baselines' budget is told: as many as asked for, else the paper's."""
+        return self.agents or paper.AGENTS
 
     @property
     def environments(self) -> list[str]:
@@ -71,20 +83,23 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
         "format": "popgen-comparison",
         "format_version": 1,
         "agents": comparison.agents,
-        "runs": [_describe_run(group, run) for group in comparison.groups for run in group.runs],
+        "runs": [_describe_run(comparison, group, run) for group in comparison.groups for run in group.runs],
         "costs": [row for group in comparison.groups for row in _list_costs(group, comparison.agents)],
         "scores": [_average_scores(group) for group in comparison.groups],
         "quality": _describe_quality(comparison),
+        "headline": list(_list_headlines(comparison)),
+        "options": [_describe_options(group) for group in comparison.groups],
         "paper": {
             name: {name_of(r.method): {"sp": r.sp, "xp": r.xp} for r in paper.REPORTED if r.environment == name}
             for name in comparison.environments
         },
-        "budgets": [_describe_budget(budget) for budget in budgets(comparison.groups, comparison.agents)],
+        "budgets": [_describe_budget(budget) for budget in budgets(comparison.groups, comparison.budget_agents)],
         "notes": _write_notes(comparison),
     }
 
 
-def _describe_run(group: Group, run: RunRecord) -> dict[str, Any]:
+def _describe_run(comparison: Comparison, group: Group, run: RunRecord) -> dict[str, Any]:
+    held = comparison.held.get(str(run.path))
     steps = {kind: sum(m.steps.get(kind, 0) for m in run.members) for kind in KINDS}
     times = [m.seconds for m in run.members if m.seconds is not None]
     return {
@@ -103,12 +118,14 @@ def _describe_run(group: Group, run: RunRecord) -> dict[str, Any]:
         "real_steps": sum(steps[str(kind)] for kind in REAL),
         "simulated_steps": steps[str(Kind.SIMULATED)],
         "evaluation_steps": run.evaluation_steps,
+        "held_episodes": None if held is None else held.episodes,
+        "held_steps": 0 if held is None else held.steps,
         "lost_steps": run.lost_steps,
         "seconds": round(sum(times), 1) if len(times) == len(run.members) else None,
     }
 
 
-def _list_costs(group: Group, agents: int) -> Iterable[dict[str, Any]]:
+def _list_costs(group: Group, agents: int | None) -> Iterable[dict[str, Any]]:
     for run in group.runs:
         for cost in costs(run, agents):
             yield {
@@ -157,13 +174,60 @@ def _describe_quality(comparison: Comparison) -> dict[str, Any]:
             continue
         for run in group.runs:
             head = {"label": group.label, "environment": group.environment, "seed": run.seed, "run": run.run_id}
-            for one in (quality(member, limits) for member in run.members):
-                members.append(head | asdict(one))
-            for many in quality_costs(run, limits):
+            held = comparison.held.get(str(run.path))
+            for one in judge_members(run, limits, held):
+                figures = {name: None if value is None else value.to_dict() for name, value in _scores_of(one).items()}
+                members.append(head | asdict(one) | figures)
+            for many in quality_costs(run, limits, held):
                 agents.append(head | asdict(many) | {"lower_bound": many.bound})
     chosen = {name: comparison.thresholds.get(name) for name in comparison.environments}
     thresholds = {name: None if limit is None else {"sp": limit.sp, "xp": limit.xp} for name, limit in chosen.items()}
     return {"thresholds": thresholds, "members": members, "agents": agents}
+
+
+def _scores_of(one: Quality) -> dict[str, Estimate | None]:
+    return {"sp": one.sp, "xp": one.xp}
+
+
+def _list_headlines(comparison: Comparison) -> Iterable[dict[str, Any]]:
+    """For each label: steps taken in all when agent M had passed, M being the most that all runs there have, and how
+    many times as many as the label with the fewest that passed."""
+    for name, limits in comparison.thresholds.items():
+        groups = [group for group in comparison.groups if group.environment == name]
+        agents = min(len(run.members) for group in groups for run in group.runs)
+        if not agents:
+            continue
+        rows = []
+        for group in groups:
+            found = [quality_costs(run, limits, comparison.held.get(str(run.path)))[agents - 1] for run in group.runs]
+            passed = sum(not one.bound for one in found)
+            steps, simulated = spread_of(one.steps for one in found), spread_of(one.simulated for one in found)
+            seeds = len(found)
+            rows.append({"label": group.label, "steps": steps, "simulated": simulated, "passed": passed, "runs": seeds})
+        least = min((row["steps"]["mean"] for row in rows if row["passed"] == row["runs"]), default=None)
+        for row in rows:
+            ratio = None if least is None else row["steps"]["mean"] / least
+            yield {"environment": name, "agents": agents, **row, "ratio": ratio}
+
+
+OPTION_WORDS = ("lambda", "clip", "stop", "target", "until", "floor", "constraint", "restart", "rounds", "bound")
+"""Settings with one of these words in their names decide how hard and how long cross-play is pressed down."""
+
+
+def _describe_options(group: Group) -> dict[str, Any]:
+    """What a method was given: settings that are not its recipe's, and those of the recipe that shape cross-play."""
+    settings = group.runs[0].settings if group.runs else {}
+    try:
+        usual = flatten_settings(recipe(group.method, group.environment, group.runs[0].scale).as_dict())
+    except (UserError, KeyError, ValueError):  # of a method or scale that is not installed here
+        usual = {}
+    given = {name: value for name, value in settings.items() if name in usual and usual[name] != value}
+    shaping = {name: settings[name] for name in sorted(settings) if _shapes_cross_play(name)}
+    return {"label": group.label, "environment": group.environment, "given": given, "cross_play": shaping}
+
+
+def _shapes_cross_play(setting: str) -> bool:
+    return any(word in setting.rpartition(".")[2] for word in OPTION_WORDS)
 
 
 def _describe_budget(budget: Budget) -> dict[str, Any]:
@@ -175,14 +239,18 @@ def _write_notes(comparison: Comparison) -> list[str]:
     """Sentences about what the figures do not say by themselves."""
     notes = ["Simulated steps (of an exact simulator used as dynamics model) are counted apart and in no total."]
     runs = [run for group in comparison.groups for run in group.runs]
-    if any(len(run.members) < comparison.agents for run in runs):
+    held = [one for run in runs if (one := comparison.held.get(str(run.path)))]
+    if held:
+        steps = sum(one.steps for one in held)
+        told = f"{held[0].episodes} episodes for each member alone, and for each pair and seating"
+        notes.append(f"A member passes by a held evaluation of its own policy: {told}; {steps:,} steps, in no total.")
+    if any(cost.rule == LINE for run in runs for cost in costs(run, comparison.agents)):
         notes.append("Points with more agents than a run has are extrapolated: a line through members 2 and up.")
+    agents = comparison.budget_agents
     for name in comparison.environments:
-        if (steps := paper.xpm_wm_budget(name, comparison.agents)) is not None:
-            notes.append(f"The paper's XPM-WM took {steps:,} steps for {comparison.agents} agents on {name}.")
+        if (steps := paper.xpm_wm_budget(name, agents)) is not None:
+            notes.append(f"The paper's XPM-WM took {steps:,} steps for {agents} agents on {name}.")
     for run in runs:
-        if len(run.members) == 1:
-            notes.append(f"{run.run_id} has one agent, from which nothing is extrapolated.")
         if run.settings.get("diversity.order") == "concurrent":
             notes.append(f"{run.run_id} trained its agents together: for fewer agents it is these agents' share.")
         if adopted := sum(m.adopted for m in run.members):

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from popgen.reports.comparison import KINDS
-from popgen.reports.frames import UNKNOWN, Sheet, number_text, range_text, to_csv
+from popgen.reports.frames import UNKNOWN, Sheet, estimate_text, number_text, range_text, to_csv
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_record import REAL
 
@@ -20,10 +20,11 @@ COST_FIELDS = (
 """Columns of costs.csv: cumulative environment steps and seconds after M agents."""
 
 QUALITY_FIELDS = (
-    *("environment", "label", "seed", "run", "member"),
-    *("steps", "simulated", "spent", "known", "sp_at_least", "xp_at_most"),
+    *("environment", "label", "seed", "run", "member", "passed", "sp", "sp_error", "xp", "xp_error", "episodes"),
+    *("taken", "simulated", "spent", "window", "sp_at_least", "xp_at_most"),
 )
-"""Columns of quality.csv; `steps` is empty where a member never passed both thresholds."""
+"""Columns of quality.csv; `passed`, `sp` and `xp` are empty without a held evaluation, `window` where no window of
+training passed both thresholds."""
 
 BUDGET_FIELDS = ("source", "method", "environment", "agents", "reading", "budget", "SP", "XP", "MP", "total", "ratio")
 """Columns of budgets.csv."""
@@ -42,7 +43,14 @@ def quality_csv(report: Mapping[str, Any]) -> str:
     rows = []
     for row in report["quality"]["members"]:
         limit = report["quality"]["thresholds"][row["environment"]]
-        rows.append({**row, "known": int(row["known"]), "sp_at_least": limit["sp"], "xp_at_most": limit["xp"]})
+        run = next(one for one in report["runs"] if all(one[key] == row[key] for key in _RUN))
+        figures: dict[str, Any] = {}
+        for name in ("sp", "xp"):
+            figure = row[name] or {"mean": None, "standard_error": None}
+            figures |= {name: figure["mean"], f"{name}_error": figure["standard_error"]}
+        passed = None if row["passed"] is None else int(row["passed"])
+        limits = {"sp_at_least": limit["sp"], "xp_at_most": limit["xp"], "episodes": run["held_episodes"]}
+        rows.append({**row, **figures, **limits, "passed": passed})
     return to_csv(rows, QUALITY_FIELDS)
 
 
@@ -58,11 +66,14 @@ def to_markdown(report: Mapping[str, Any]) -> str:
 
 
 def to_sheets(report: Mapping[str, Any]) -> Iterator[Sheet]:
-    """Cost, scores, steps to equal quality, and both readings of the budget."""
+    """Headline, cost, scores, quality by agent, options, and both readings of the budget."""
+    if report["headline"]:
+        yield _make_headline_sheet(report)
     yield _make_cost_sheet(report)
     yield _make_score_sheet(report)
     if report["quality"]["members"]:
         yield _make_quality_sheet(report)
+    yield _make_option_sheet(report)
     if report["budgets"]:
         yield _make_budget_sheet(report)
 
@@ -125,29 +136,69 @@ def _score_cells(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _make_quality_sheet(report: Mapping[str, Any]) -> Sheet:
+def _make_headline_sheet(report: Mapping[str, Any]) -> Sheet:
     cells = []
-    for run in report["runs"]:
-        members = _select_run(report["quality"]["members"], run)
-        if not members:
-            continue
-        limit = report["quality"]["thresholds"][run["environment"]]
-        total = _select_run(report["quality"]["agents"], run)[-1]
-        bound = "> " if total["lower_bound"] else ""
-        texts = {
-            "thresholds": f"SP >= {limit['sp']:g}, XP <= {limit['xp']:g}",
-            "real steps of each agent": "  ".join(_quality_text(member) for member in members),
-            "sum": f"{bound}{total['steps']:,}",
-            "simulated": f"{bound}{total['simulated']:,}" if total["simulated"] else "0",
-            "took": f"{run['real_steps']:,}",
-        }
-        cells.append(_start_row(run) | texts)
-    title = "real steps to equal quality (- never, ? no learning curve; took: in all)"
+    for row in report["headline"]:
+        bound = "" if row["passed"] == row["runs"] else "> "
+        cells.append(
+            {
+                "environment": row["environment"],
+                "method": title_of(row["label"]),
+                "agents": str(row["agents"]),
+                "passed": f"{row['passed']} of {row['runs']} runs",
+                "steps taken by then": f"{bound}{_steps_text(row['steps'])}",
+                "simulated": _steps_text(row["simulated"]),
+                "times the least": bound + number_text(row["ratio"], 1) if row["ratio"] is not None else UNKNOWN,
+            }
+        )
+    title = "real steps taken in all when agent M had passed, all that it builds on included (range over seeds)"
     return Sheet(title, pd.DataFrame(cells), labels=2)
 
 
-def _quality_text(member: Mapping[str, Any]) -> str:
-    return "?" if not member["known"] else UNKNOWN if member["steps"] is None else f"{member['steps']:,}"
+def _steps_text(spread: Mapping[str, float | None]) -> str:
+    mean, low, high = (spread[key] for key in ("mean", "low", "high"))
+    if mean is None or low is None or high is None:
+        return UNKNOWN
+    return f"{mean:,.0f}" if low == high else f"{mean:,.0f} ({low:,.0f} to {high:,.0f})"
+
+
+def _make_quality_sheet(report: Mapping[str, Any]) -> Sheet:
+    cells = []
+    for run in report["runs"]:
+        limit = report["quality"]["thresholds"][run["environment"]]
+        for one in _select_run(report["quality"]["members"], run):
+            passed = {None: "?", True: "yes", False: "no"}[one["passed"]]
+            texts = {
+                "agent": str(one["member"]),
+                "thresholds": f"SP >= {limit['sp']:g}, XP <= {limit['xp']:g}",
+                "SP": UNKNOWN if one["sp"] is None else estimate_text(one["sp"]),
+                "XP": UNKNOWN if one["xp"] is None else estimate_text(one["xp"]),
+                "passed": passed,
+                "taken by then": f"{one['taken']:,}",
+                "simulated": f"{one['simulated']:,}",
+                "own": f"{one['spent']:,}",
+                "a window of training": UNKNOWN if one["window"] is None else f"{one['window']:,}",
+            }
+            cells.append(_start_row(run) | texts)
+    title = "held evaluation of each agent; real steps taken in all (a window of training is no evidence)"
+    return Sheet(title, pd.DataFrame(cells), labels=2)
+
+
+def _make_option_sheet(report: Mapping[str, Any]) -> Sheet:
+    cells = [
+        {
+            "environment": row["environment"],
+            "method": title_of(row["label"]),
+            "not its recipe's": _options_text(row["given"]),
+            "of its recipe, on cross-play": _options_text(row["cross_play"]),
+        }
+        for row in report["options"]
+    ]
+    return Sheet("what each method was given", pd.DataFrame(cells), labels=2)
+
+
+def _options_text(options: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value}" for name, value in options.items()) or UNKNOWN
 
 
 def _make_budget_sheet(report: Mapping[str, Any]) -> Sheet:
