@@ -387,13 +387,14 @@ def test_csv_marks_what_was_extrapolated(comparison: Comparison) -> None:
     assert found[CRAMPED, "comedi", "3"]["MP"] == "900" and (CRAMPED, "comedi", "4") not in found
     good = list(csv.DictReader(io.StringIO(comparison_report.quality_csv(told))))
     assert tuple(good[0]) == comparison_report.QUALITY_FIELDS
-    told = [(row["passed"], row["taken"], row["window"], row["episodes"]) for row in good if row["run"] == "model"]
-    assert told == [
-        ("1", "1000", "600", "20"),
-        ("1", "1110", "1080", "20"),
-        ("0", "1230", "", "20"),
-        ("1", "1360", "", "20"),
+    own = [row for row in good if row["run"] == "model"]
+    assert [(row["passed"], row["taken"]) for row in own] == [
+        ("1", "1000"),
+        ("1", "1110"),
+        ("0", "1230"),
+        ("1", "1360"),
     ]
+    assert [row["window"] for row in own] == ["600", "1080", "", ""] and {row["episodes"] for row in own} == {"20"}
     budget = list(csv.DictReader(io.StringIO(comparison_report.budgets_csv(told))))
     assert tuple(budget[0]) == comparison_report.BUDGET_FIELDS and len(budget) == 8 + 4
 
