@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.methods.recipe import Recipe, Settings
-from popgen.methods.transport import OpenTraining
+
+if TYPE_CHECKING:
+    from popgen.methods.transport import OpenTraining
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
+from conftest import ROOT
 
 import popgen
 from popgen.cli.compose import compose
@@ -116,3 +119,14 @@ def test_a_broken_package_spoils_its_own_method_only(offer: Any, given: Any) -> 
     with pytest.raises(UserError, match="repair its package"):
         find_method("toy")
     assert RunConfig.parse(compose(["method=lipo"])).method == "lipo"
+
+
+def test_records_of_all_methods_are_read_without_what_only_training_needs() -> None:
+    program = (
+        "import sys\n"
+        "sys.modules |= dict.fromkeys(('ray', 'mlflow', 'torch', 'hydra'))\n"
+        "from popgen.methods.registry import METHODS\n"
+        "print(len([METHODS[name] for name in METHODS]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == str(len(registry.BUILT_IN)), done.stderr

@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from popgen.envs.contract import EnvSpec
-from popgen.errors import UserError
 from popgen.methods.mappo.config import FcpRun
-from popgen.methods.mappo.needs import check_view
+from popgen.methods.mappo.needs import SKILLS
 from popgen.methods.mappo.objective import SELF_PLAY
 from popgen.methods.mappo.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
 from popgen.methods.mappo.train import RllibTraining, refuse_inline
@@ -21,9 +20,6 @@ from popgen.methods.mappo.training_job import policy_config
 from popgen.methods.training import Checkpoint, Loop, State, TrainedMember
 from popgen.methods.transport import Transport
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
-
-SKILLS = ("initial", "half", "final")
-"""Of a seed's members, in order."""
 
 
 class FcpTraining(RllibTraining):
@@ -79,19 +75,6 @@ class FcpTraining(RllibTraining):
         """See `Training`."""
         super().restore(checkpoint)
         self.skills = SkillCheckpoints.from_state(checkpoint.state["skills"])
-
-
-def check_fcp(config: FcpRun, spec: EnvSpec) -> None:
-    """The view, and whole seeds.
-
-    Raises:
-        UserError: a view that the environment does not have, or members that are no whole seeds.
-    """
-    check_view(config, spec)
-    size, each = config.population.size, len(SKILLS)
-    if size % each:
-        problem = f"{size} is no multiple of {each}: each seed gives an initial, a half trained and a final member"
-        raise UserError("population.size", problem, f"set it to {size + each - size % each}")
 
 
 def open_training(config: FcpRun, spec: EnvSpec, attempt: str, transport: Transport) -> FcpTraining:

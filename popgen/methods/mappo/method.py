@@ -1,9 +1,9 @@
 """The baselines on RLlib's MAPPO as the rest of the house knows them."""
 
 from popgen.methods.mappo.config import ComediRun, FcpRun, LipoRun, MappoRun, MepRun, TrajediRun
-from popgen.methods.mappo.fcp import check_fcp
 from popgen.methods.mappo.needs import (
     check_comedi,
+    check_fcp,
     check_view,
     estimate_comedi,
     estimate_lipo,

@@ -9,8 +9,11 @@ import numpy as np
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, count_numbers
-from popgen.methods.mappo.config import BaselineRun, ComediRun, LipoRun, PpoConfig
+from popgen.methods.mappo.config import BaselineRun, ComediRun, FcpRun, LipoRun, PpoConfig
 from popgen.methods.method import ActorDemand, Needs, ask_for
+
+SKILLS = ("initial", "half", "final")
+"""Of the members of a seed of FCP, in order."""
 
 
 def list_actors(config: BaselineRun) -> list[ActorDemand]:
@@ -95,3 +98,16 @@ def check_comedi(config: ComediRun, spec: EnvSpec) -> None:
     check_view(config, spec)
     if config.diversity.order != "sequential":
         raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")
+
+
+def check_fcp(config: FcpRun, spec: EnvSpec) -> None:
+    """The view, and whole seeds.
+
+    Raises:
+        UserError: a view that the environment does not have, or members that are no whole seeds.
+    """
+    check_view(config, spec)
+    size, each = config.population.size, len(SKILLS)
+    if size % each:
+        problem = f"{size} is no multiple of {each}: each seed gives an initial, a half trained and a final member"
+        raise UserError("population.size", problem, f"set it to {size + each - size % each}")

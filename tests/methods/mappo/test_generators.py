@@ -12,8 +12,8 @@ from support.rollouts import VIEW, reads_observation, rollout, sp
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
-from popgen.methods.mappo.fcp import check_fcp
 from popgen.methods.mappo.mep import SurpriseBonus
+from popgen.methods.mappo.needs import check_fcp
 from popgen.methods.mappo.pooling import Plan, gather, pool
 from popgen.methods.mappo.population_bonus import joint_log_probs
 from popgen.methods.mappo.skill_checkpoints import KEPT, SkillCheckpoint, SkillCheckpoints
