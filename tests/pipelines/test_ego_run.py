@@ -1,0 +1,123 @@
+"""Whole runs of egos at `scale=smoke`, in this process: what they leave behind, interrupted anywhere, refused."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.small import kitchen
+
+from popgen.actors.checkpoint_writer import CheckpointFiles
+from popgen.actors.ego_workers import open_training
+from popgen.errors import UserError
+from popgen.methods.ego.config import EgoRun
+from popgen.methods.transport import InlineTransport
+from popgen.pipelines.ego_training import make_ego_config
+from popgen.pipelines.training_driver import TrainingDriver
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.simple_policies import RandomPolicy
+from popgen.population import PopulationWriter, load_population
+from popgen.progress import NullReporter
+from popgen.runs.ledger import Ledger
+from popgen.runs.preflight import preflight
+from popgen.runs.recorder import RunRecorder
+from popgen.types import Kind
+
+SETTINGS: dict[str, Any] = {"run.seed": 3, "ego.steps": 640, "tracking.enabled": False, "ego.unroll": 40}
+ROUNDS = 4
+
+
+class Killed(RuntimeError):
+    """Injected where a driver could be killed."""
+
+
+@pytest.fixture(scope="module")
+def partners(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two networks and a random player."""
+    spec, path = kitchen(horizon=40).spec, tmp_path_factory.mktemp("partners") / "three"
+    writer = PopulationWriter(path, spec, method="mappo", config_digest="a" * 64, seed=5)
+    for seed in range(2):
+        policy = FeedForwardPolicy(spec.views["features"], spec.num_actions, units=4, layers=1, seed=seed)
+        writer.add_member(policy, seed=50 + seed, steps={})
+    writer.add_member(RandomPolicy(spec.num_actions), seed=52, steps={})
+    return path
+
+
+def launch(root: Path, name: str, config: EgoRun, monkeypatch: pytest.MonkeyPatch, die_at: int = 0) -> Path:
+    """Train in this process, a checkpoint after every iteration; the run dies before writing the `die_at`-th."""
+    monkeypatch.setattr("popgen.methods.ego.train.ROUND", 1)
+    calls: Counter[str] = Counter()
+
+    class Files(CheckpointFiles):
+        def save(self, *given: Any, **named: Any) -> None:
+            calls["save"] += 1
+            if calls["save"] == die_at:
+                raise Killed
+            super().save(*given, **named)
+
+    config = config.model_copy(update={"run": config.run.model_copy(update={"id": name, "root": str(root)})})
+    spec = preflight(config)
+    recorder = RunRecorder(config, spec)
+    training = open_training(config, spec, f"{recorder.run_id}.{recorder.attempt}", InlineTransport())
+    try:
+        driver = TrainingDriver(config, recorder, NullReporter(), training, Files(recorder.dir, long=1, seconds=0.0))
+        driver.train_members()
+    finally:
+        recorder.close("FINISHED")
+    return root / name
+
+
+@pytest.mark.parametrize("method", ["hipt", "fcp", "sp_aug"])
+def test_a_run_that_was_killed_ends_as_one_that_was_not(
+    method: str, partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {**SETTINGS, "env.params": {"horizon": 40}}
+    named = [] if method == "sp_aug" else [str(partners)]
+    config = make_ego_config(method, named, settings, scale="smoke")
+    whole = launch(tmp_path, "whole", config, monkeypatch)
+    with pytest.raises(Killed):
+        launch(tmp_path, "killed", config, monkeypatch, die_at=3)
+    launch(tmp_path, "killed", config, monkeypatch)
+    egos = [load_population(run / "population").info(1) for run in (whole, tmp_path / "killed")]
+    assert egos[0].policy_sha256 == egos[1].policy_sha256 and egos[0].training_sha256 == egos[1].training_sha256
+    kind = Kind.SP if method == "sp_aug" else Kind.XP
+    ledgers = [Ledger(run / "ledger.jsonl") for run in (whole, tmp_path / "killed")]
+    assert [ledger.steps(1, kind) for ledger in ledgers] == [640, 640]
+    assert ledgers[0].episodes(1, kind) == ledgers[1].episodes(1, kind) > 0
+
+
+def test_an_ego_says_what_it_was_trained_with_and_plays_as_a_member(
+    partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = launch(tmp_path, "ego", make_ego_config("fcp", [f"{partners}:1,3"], SETTINGS, scale="smoke"), monkeypatch)
+    ego, source = load_population(run), load_population(partners)
+    (told,) = ego.info(1).extra["trained_with"]
+    assert (told["method"], told["seed"], told["members"]) == ("mappo", 5, [1, 3])
+    assert told["policy_sha256"] == [source.info(member).policy_sha256 for member in (1, 3)]
+    assert ego.manifest.environment.fingerprint == source.manifest.environment.fingerprint
+    response = make_ego_config("br", [str(run)], SETTINGS, scale="smoke")  # egos are partners like others
+    launch(tmp_path, "response", response, monkeypatch)
+
+
+def test_what_cannot_be_trained_is_told_in_one_line(partners: Path) -> None:
+    for method, named, settings, field in (
+        ("br", [str(partners)], {}, "ego.partners"),
+        ("fcp", [f"{partners}:4"], {}, "ego.partners"),
+        ("sp", [str(partners)], {}, "ego.partners"),
+        ("hipt", [], {}, "ego.partners"),
+        ("mappo", [], {}, "method"),
+        ("fcp", [str(partners)], {"ego.sequence": 7}, "ego.sequence"),
+        ("hipt", [str(partners)], {"hipt.duration_most": 50}, "ego.unroll"),
+    ):
+        with pytest.raises(UserError) as caught:
+            preflight(make_ego_config(method, named, {**SETTINGS, **settings}, scale="smoke"))
+        assert caught.value.field == field
+
+
+def test_partners_that_changed_are_refused(partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = make_ego_config("fcp", [str(partners)], SETTINGS, scale="smoke")
+    other = config.ego.model_copy(update={"pinned": ("0" * 64,)})
+    with pytest.raises(UserError, match="has changed"):
+        launch(tmp_path, "changed", config.model_copy(update={"ego": other}), monkeypatch)
