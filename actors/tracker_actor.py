@@ -37,9 +37,10 @@ class TrackerActor:
         run_name: str,
         params: Mapping[str, Any],
         resume: Mapping[str, Any] | None,
+        store: str | None = None,
     ) -> None:
         """See `Tracker`; not done in the constructor, whose errors reach nobody with their type."""
-        self.tracker = Tracker(config, run_dir, run_name, params, resume)
+        self.tracker = Tracker(config, run_dir, run_name, params, resume, store=store)
 
     def call(self, method: str, *arguments: Any) -> None:
         """A method of the `Tracker`; nothing where no store was opened."""
@@ -69,7 +70,10 @@ class RemoteTracker:
         run_name: str,
         params: Mapping[str, Any],
         resume: Mapping[str, Any] | None = None,
+        *,
+        store: Path | None = None,
     ) -> None:
+        self._store = None if store is None else str(store)
         self._enabled, self._arguments = config.enabled, (config, str(run_dir), run_name, params)
         self._state: dict[str, Any] | None = None if resume is None else dict(resume)
         self._actor: Any = None
@@ -97,9 +101,13 @@ class RemoteTracker:
         """Metrics at `step` of the population (member None) or of one member."""
         self._send_call("log", dict(metrics), step, member, int(time.time() * 1000))
 
-    def log_scaling(self, members: int, environment_steps: int) -> None:
-        """Environment steps so far, with step = number of members."""
-        self._send_call("log_scaling", members, environment_steps)
+    def log_scaling(self, members: int, environment_steps: int, kinds: Mapping[str, int] | None = None) -> None:
+        """Environment steps so far, in all and by kind, with step = number of members."""
+        self._send_call("log_scaling", members, environment_steps, None if kinds is None else dict(kinds))
+
+    def describe(self, text: str, overview: str = "") -> None:
+        """Markdown of the run and of its experiment."""
+        self._send_call("describe", text, overview)
 
     def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
         """Copy a file or folder to the run's artefacts."""
@@ -131,7 +139,7 @@ class RemoteTracker:
         """An actor on the driver's node, whose files it reads, that gets all that may not have been written."""
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
         self._actor = ray.remote(TrackerActor).options(num_cpus=0, scheduling_strategy=here).remote()
-        ray.get(self._actor.open.remote(*self._arguments, self._state))
+        ray.get(self._actor.open.remote(*self._arguments, self._state, self._store))
         self._mark = None
         for call in self._unwritten:
             self._actor.call.remote(*call)

@@ -15,7 +15,7 @@ from popgen.progress import Reporter
 from popgen.reports.comparison import Group, costs, group_runs, quality_costs
 from popgen.reports.comparison_report import Comparison, chosen_thresholds, to_dict, write_report
 from popgen.reports.run_record import REAL, RunRecord, planned_run, read_run
-from popgen.runs.mlflow_tracker import Tracker
+from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker
 
 EXPERIMENT = "popgen-compare"
 """Name of the MLflow experiment that comparisons go to."""
@@ -84,20 +84,34 @@ def hold_runs(
 
 
 def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path, tracking: TrackingConfig) -> None:
-    """An MLflow run for each run compared, with step = number of agents, and one that holds the report."""
+    """One MLflow run for the comparison, with its tables and pictures, and a nested one for each run compared."""
+    told = {"agents": comparison.agents or 0, "runs": len(_list_runs(comparison))}
+    whole = Tracker(tracking, out, "comparison", told)
     for group in comparison.groups:
         for run in group.runs:
-            tracker = Tracker(
-                tracking, out, f"{group.label}/{group.environment}/s{run.seed}", _describe_run(group, run)
-            )
-            for agents, figures in points(comparison, group, run).items():
-                tracker.log(figures, step=agents)
+            name = f"{group.label}/{group.environment}/s{run.seed}"
+            tracker = Tracker(tracking, out, name, _describe_run(group, run), parent=whole.run_id)
+            figures = drop_constant_zeros(points(comparison, group, run))
+            for agents, row in figures.items():
+                tracker.log(row, step=agents)
+                if SCALING_METRIC in row:
+                    whole.log({f"environment_steps/{name}": row[SCALING_METRIC]}, step=agents)
+            tracker.log({SCALING_METRIC: 0.0}, step=0)
+            whole.log({f"environment_steps/{name}": 0.0}, step=0)
             tracker.finish()
-    described = {"agents": comparison.agents or 0, "runs": len(_list_runs(comparison))}
-    tracker = Tracker(tracking, out, "comparison", described)
     for path in files.values():
-        tracker.log_artifact(path, "comparison")
-    tracker.finish()
+        whole.log_artifact(path, "comparison")
+    if "comparison.md" in files:
+        pictures = [name for name in files if name.endswith(".png")]
+        shown = "\n".join(f"![{Path(name).stem}](artefact:comparison/{name})" for name in pictures)
+        whole.describe(f"{shown}\n\n{files['comparison.md'].read_text(encoding='utf-8')}")
+    whole.finish()
+
+
+def drop_constant_zeros(points: Mapping[int, Mapping[str, float]]) -> dict[int, dict[str, float]]:
+    """Without the figures that are 0 everywhere: they would be empty charts."""
+    some = {name for row in points.values() for name, value in row.items() if value}
+    return {agents: {name: row[name] for name in row if name in some} for agents, row in points.items()}
 
 
 def points(comparison: Comparison, group: Group, run: RunRecord) -> dict[int, dict[str, float]]:

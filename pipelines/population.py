@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -24,18 +25,22 @@ from popgen.evaluation.weak_members import WeakMember, find_weak_members
 from popgen.methods.registry import METHODS
 from popgen.methods.training import Training
 from popgen.methods.transport import InlineTransport, Transport
+from popgen.pages.report_source import read_source
+from popgen.pages.run_report import list_findings, write_run_report
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.reports.crossplay_report import list_warnings, to_dict, write_report
 from popgen.reports.method_titles import title_of
+from popgen.reports.run_description import describe_experiment, describe_run
 from popgen.reports.run_figures import write_run_figures
 from popgen.runs.directory import RunState, named, run_folder
-from popgen.runs.mlflow_tracker import LocalTracker
+from popgen.runs.mlflow_tracker import STORE, LocalTracker, choose_store, view_address
 from popgen.runs.monitoring import LoggingReporter, gauge
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import RetryBudget, actor_failure, first_line, nodes_alive, user_facing_error, wait_for_room
 from popgen.runs.storage import Mirror
+from popgen.runs.tracking_address import sqlite_uri
 
 HALT_SECONDS = 30.0
 """Least time between two checkpoints where all overlapping work halts for one."""
@@ -55,8 +60,9 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
 
     Returns:
         run_id, run_dir, population (path), members (count), ledger (steps by member and kind), matrix and evaluation
-        (`popgen.reports.crossplay_report`), warnings (what of it speaks against low cross-play, in sentences), files
-        (paths by name or suffix), seconds.
+        (`popgen.reports.crossplay_report`), warnings (what of it speaks against low cross-play, in sentences), mlflow
+        (command and address that show the run, None without tracking), findings (text and good: what the figures
+        mean), files (paths by name or suffix), seconds.
 
     Raises:
         UserError: training diverged, the disk is (nearly) full, a checkpoint to continue from is damaged, another
@@ -70,7 +76,9 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         if restored := Mirror(run_folder(config), config.run.storage).pull():
             reporter.note(restored)
     tracker_kind = RemoteTracker if config.run.transport == "ray" else LocalTracker
-    tracker = tracker_kind(config.tracking, run_folder(config), str(config.run.id), config.as_dict())
+    folder = run_folder(config)
+    store = choose_store(folder, config.run.storage)
+    tracker = tracker_kind(config.tracking, folder, str(config.run.id), config.as_dict(), store=store)
     recorder = RunRecorder(config, spec, tracker)
     reporter.note(f"run {recorder.run_id} in {recorder.dir}")
     job = PopulationJob(config, spec, recorder, reporter)
@@ -204,9 +212,12 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     files |= write_run_figures(
         recorder.dir, recorder.dir / "report", recorder.member_steps(), unit=spec.score_name, title=title
     )
+    source = read_source(recorder.dir)
+    files["report"] = write_run_report(source, seed=config.run.seed)["report"]
     recorder.log_artefacts(files.values())
     figures = {"sp": result.sp.mean, "xp": result.xp.mean}
     recorder.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
+    recorder.tracker.describe(describe_run(source.run, list_findings(source)), describe_experiment(recorder.dir))
     evaluation = to_dict(result)
     weak = [one.describe(spec.score_name) for one in list_weak_members(config, recorder, result)]
     for line in weak:
@@ -219,8 +230,10 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         "ledger": recorder.ledger.table(),
         "matrix": evaluation["matrix"],
         "evaluation": evaluation,
+        "mlflow": _find_mlflow(config, recorder),
         "warnings": list_warnings(evaluation),
         "weak_members": weak,
+        "findings": [finding.as_dict() for finding in list_findings(source)],
         "files": {suffix: str(file) for suffix, file in files.items()},
         "seconds": round(time.time() - recorder.began, 1),
     }
@@ -231,3 +244,15 @@ def list_weak_members(config: RunConfig, recorder: RunRecorder, result: CrossPla
     infos = load_population(recorder.dir / "population").members
     targets = {info.id: float(info.extra["target"]) for info in infos if "target" in info.extra}
     return find_weak_members(result, targets, config.evaluation.weak_share)
+
+
+def _find_mlflow(config: RunConfig, recorder: RunRecorder) -> dict[str, str] | None:
+    """How to look at the run in MLflow."""
+    tracking = config.tracking
+    if not tracking.enabled:
+        return None
+    state = recorder.tracker.flush()
+    if tracking.uri is not None and tracking.uri.startswith("http"):
+        return {"command": "", "address": view_address(state, tracking.uri.rstrip("/"))}
+    uri = tracking.uri or sqlite_uri(choose_store(recorder.dir, config.run.storage) / STORE)
+    return {"command": f"mlflow ui --backend-store-uri {shlex.quote(uri)}", "address": view_address(state)}

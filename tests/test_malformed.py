@@ -31,7 +31,8 @@ RUN = (
     *("scale=smoke", "tracking=off", "population.size=2", "env.params.horizon=20", "seed=3", "run.root=runs"),
     *("run.id=r", "run.transport=inline", "phase1.max_steps=2600", "evaluation.episodes=1"),
 )
-OF_ATTEMPTS = {"attempts.txt", "run.lock", "run.log", "state.json"}  # what each attempt adds to, damaged run or not
+# What each attempt adds to, damaged run or not.
+OF_ATTEMPTS = {"attempts.txt", "provenance.jsonl", "run.lock", "run.log", "state.json"}
 HEADER = b'{"a":' + b"[" * 50_000
 
 

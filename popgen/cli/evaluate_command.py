@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
         metavar=_NAMED,
         nargs="+",
         type=named_path,
-        help="folder that holds manifest.json; with --with also module:Agent, and one NAME for several seeds of an ego",
+        help="population or its run; with --with also module:Agent, and one NAME for several seeds of an ego",
     )
     parser.add_argument(
         *("--with",),
@@ -93,7 +93,7 @@ def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
         name = args.env or info.name
         params = {**(info.params if name == info.name else {}), **dict(args.param)}
         check_compatible(population, make_env(name, 1, **params).spec)
-    out = Path(args.out) if args.out else Path(path) / "evaluation"
+    out = Path(args.out) if args.out else population.path / "evaluation"
     check_root(out, 16 * 2**20, "--out")
     from popgen.evaluation.crossplay import evaluate_population
     from popgen.reports.crossplay_report import matrix_sheet, mixed_play_sheet, summary, to_dict, write_report

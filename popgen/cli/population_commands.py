@@ -21,7 +21,7 @@ def add(commands: Any) -> None:
         "Keys of --json: path, manifest, bytes (of all members' files), steps (by kind), total_steps, members "
         "(member.json with total_steps, bytes and parameters).",
     )
-    parser.add_argument("population", metavar="POPULATION", help="folder that holds manifest.json")
+    parser.add_argument("population", metavar="POPULATION", help="folder of a population, or of its run")
     parser = add_command(
         commands,
         "runs",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import textwrap
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -18,6 +19,9 @@ from popgen.errors import UserError
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
+
+WIDTH = 80
+"""Columns of the last screen."""
 
 
 def add(commands: Any) -> None:
@@ -118,14 +122,36 @@ def _print_config(values: dict[str, Any], as_json: bool) -> int:
 
 
 def _print_run(result: Mapping[str, Any]) -> None:
+    """The last screen: the matrix, what it means, what it took, and how to go on; 80 columns."""
     from popgen.reports.crossplay_report import matrix_sheet, summary
+    from popgen.reports.run_findings import next_commands
 
-    print_table(matrix_sheet(result["evaluation"], narrow=True).to_rich())
-    print("\n".join(summary(result["evaluation"])))
+    evaluation = result["evaluation"]
+    print_table(matrix_sheet(evaluation, narrow=True).to_rich())
+    print("\n".join(summary(evaluation)))
+    if findings := result.get("findings"):
+        print("\nwhat it means")
+        for finding in findings:
+            mark = {True: "+", False: "!", None: "."}[finding["good"]]
+            print(textwrap.fill(finding["text"], WIDTH, initial_indent=f"  {mark} ", subsequent_indent="    "))
+    print()
     for who, row in result["ledger"].items():
         kinds = ", ".join(f"{kind} {steps:,}" for kind, steps in row.items() if steps and kind != "total")
         print(f"environment steps, {'all' if who == 'total' else f'member {who}'}: {kinds}")
     print(f"time: {result['seconds'] / 60:.1f} minutes")
-    print(f"population: {result['population']}   ledger, checkpoints and reports: {result['run_dir']}")
+    files = result.get("files", {})
+    if "report" in files:
+        print(f"\npage:     {files['report']} (open it in a browser)")
+        print(f"pictures: {', '.join(sorted(name for name in map(_name_file, files.values()) if '.png' in name))}")
+    if shown := result.get("mlflow"):
+        print(f"mlflow:   {shown['command']}\n          {shown['address']}")
+    print("\nnext")
+    for command, what in next_commands(result["run_dir"], result["members"]):
+        print(f"  {command}\n      {what}")
+    print(f"\npopulation: {result['population']}\nledger, checkpoints and reports: {result['run_dir']}")
     for line in result["weak_members"]:
-        print(line)
+        print(textwrap.fill(line, WIDTH))
+
+
+def _name_file(path: str) -> str:
+    return path.rpartition("/")[2]

@@ -90,7 +90,7 @@ class TrackingConfig(Schema):
     enabled: StrictBool = True
     """Whether MLflow follows the run."""
     uri: str | None = None
-    """MLflow's tracking URI; null keeps a sqlite store in the run's folder."""
+    """MLflow's tracking URI; null: a sqlite store in `run.root`, of all runs there."""
     experiment: str = "popgen"
     """Name of the MLflow experiment."""
     system_metrics: StrictBool = False

@@ -24,6 +24,7 @@ import numpy as np
 
 from popgen.envs.contract import BatchedEnv
 from popgen.errors import UserError
+from popgen.evaluation.crossplay import PARTNERS
 from popgen.pages.game_recording import RecordedGame, draw_states
 from popgen.pages.page_template import fill_page
 from popgen.pages.tile_atlas import TILE, TileAtlas, to_data_url
@@ -83,7 +84,9 @@ def _describe_game(game: RecordedGame, env: BatchedEnv, atlas: TileAtlas) -> dic
 
 def name_player(label: str) -> str:
     """A label as people read it."""
-    return f"member {label}" if label.isdecimal() else f"{label} partner"
+    if label in PARTNERS:
+        return f"{label} partner"
+    return f"member {label}" if label.isdecimal() else label
 
 
 def name_game(players: Sequence[str], score: float, unit: str) -> str:

@@ -85,12 +85,12 @@ class RunRecord:
 
 
 def read_run(path: str | Path, label: str | None = None) -> RunRecord:
-    """Read a finished run's folder.
+    """Read a finished run's folder, or that of its population.
 
     Raises:
         UserError: no run, one that is not finished, or one whose files are damaged or contradict each other.
     """
-    path = Path(path)
+    path = _find_run(Path(path))
     config = _read_config(path)
     population = load_population(path / "population")
     wanted = int(config["population"]["size"])
@@ -119,6 +119,13 @@ def read_run(path: str | Path, label: str | None = None) -> RunRecord:
         attempts=_count_attempts(path / "attempts.txt"),
         scores=scores,
     )
+
+
+def _find_run(path: Path) -> Path:
+    """The run that a population lies in; other paths as they are."""
+    if (path / "manifest.json").is_file() and (path.resolve().parent / "config.json").is_file():
+        return path.parent if path.name == "population" else path.resolve().parent
+    return path
 
 
 def planned_run(config: RunConfig, label: str | None = None) -> RunRecord:

@@ -23,6 +23,7 @@ from popgen.population.manifest import MemberInfo
 from popgen.runs.directory import RunState, describe_end, named, run_folder
 from popgen.runs.ledger import Ledger
 from popgen.runs.monitoring import DiskWatch, RunLog
+from popgen.runs.provenance import note_attempt
 from popgen.runs.sinks.gauge_sink import GaugeSink
 from popgen.runs.sinks.ledger_sink import LedgerSink
 from popgen.runs.sinks.metrics_sink import MetricsSink
@@ -61,6 +62,7 @@ class RunRecorder:
         self.state = RunState(self.dir)
         _check_same_config(self.dir, config)
         self.attempt = _count_attempt(self.dir)
+        note_attempt(self.dir)
         metrics = MetricsSink(self.dir, self.began)
         self.ledger = Ledger(self.dir / "ledger.jsonl")
         self.population = _open_population(self.dir, config, spec)
@@ -174,7 +176,9 @@ class RunRecorder:
         """Save the next member with its steps so far."""
         member, steps = len(self.population) + 1, self.training_steps(len(self.population) + 1)
         self.population.add_member(policy, seed=seed, steps=steps, training=training, extra=extra)
-        added = MemberAdded(member, sum(steps.values()), sum(self.member_steps()), self._following_member())
+        kinds = _count_kinds(self.population.path, self.ledger)
+        real = sum(count for kind, count in kinds.items() if kind != Kind.SIMULATED)
+        added = MemberAdded(member, sum(steps.values()), real, self._following_member(), kinds)
         for sink in self.sinks:
             sink.on_member(added)
 
@@ -231,6 +235,16 @@ class RunRecorder:
     def _log_end(self, status: str, error: BaseException | None) -> None:
         text = None if error is None else describe_end(error)
         self.events.write("end", level="INFO" if error is None else "ERROR", status=status, error=text)
+
+
+def _count_kinds(population: Path, ledger: Ledger) -> dict[str, int]:
+    """Environment steps of all members' training by kind, and simulated ones of this run."""
+    kinds: Counter[str] = Counter()
+    for info in load_population(population).members:
+        kinds.update(info.steps)
+    if simulated := ledger.steps(kind=Kind.SIMULATED):
+        kinds[str(Kind.SIMULATED)] = simulated
+    return dict(kinds)
 
 
 def _check_same_config(folder: Path, config: RunConfig) -> None:

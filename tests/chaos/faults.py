@@ -122,9 +122,10 @@ def check_tracking(hit: Hit) -> None:
     import json
     import sqlite3
 
-    with sqlite3.connect(hit.run / "mlflow.db") as store:
-        runs = store.execute("select count(*), sum(status = 'FINISHED') from runs").fetchone()
-        points = store.execute("select count(*) from metrics where key = 'real_sp'").fetchone()[0]
+    with sqlite3.connect(hit.run.parent / "mlflow.db") as store:
+        own = f"run_uuid in (select run_uuid from tags where key = 'popgen.run' and value = '{hit.run.name}')"
+        runs = store.execute(f"select count(*), sum(status = 'FINISHED') from runs where {own}").fetchone()
+        points = store.execute(f"select count(*) from metrics where key = 'real_sp' and {own}").fetchone()[0]
     rows = [json.loads(text) for text in (hit.run / "metrics.jsonl").read_text().splitlines()]
     wanted = sum("real_sp" in row for row in rows)
     if runs != (3, 3) or points != wanted:

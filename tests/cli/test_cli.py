@@ -324,6 +324,8 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
         "matrix": {"mean": [[9.0, 0.25], [float("nan"), 8.0]], "standard_error": [[0.5, 0.1], [None, 0.1]]},
         "weak_members": [],
         "seconds": 90.0,
+        "findings": [{"text": "bad for " + "reasons " * 20, "good": False}],
+        "files": {"report": "runs/r/report/report.html", "png": "runs/r/report/crossplay.png"},
     }
     environment = {"name": "overcooked/cramped_room"}
     evaluation = {"environment": environment, "unit": "dishes", "members": [1, 2], "sp": figure, "xp": figure}
@@ -353,7 +355,8 @@ def test_run_hands_the_config_over_and_prints_the_result(run: Run, monkeypatch: 
     code, out, _ = run("run", "scale=smoke", "--quiet")
     assert code == 0 and "9.00" in out and "±0.50" in out and "1,234" in out
     assert "obstruction: XP is below play beside random partners" in out
-    assert out.splitlines()[-1] == "population: runs/r/population   ledger, checkpoints and reports: runs/r"
+    assert out.splitlines()[-1] == "ledger, checkpoints and reports: runs/r" and max(map(len, out.splitlines())) <= 80
+    assert all(part in out for part in ("  ! bad for", "  popgen play runs/r --watch 1 2", "crossplay.png"))
     result["weak_members"] = ["member 2 does not play"]
     code, out, _ = run("run", "scale=smoke", "--quiet")
     assert code == 3 and out.splitlines()[-1] == "member 2 does not play"

@@ -354,7 +354,7 @@ def test_a_whole_run_is_evaluated(root: Path) -> None:
     table = result["ledger"]
     assert {kind: table["2"][kind] for kind in ("SP", "XP")} == {"SP": SP_STEPS, "XP": SP_STEPS}
     assert table["2"]["evaluation"] > 0 and np.shape(result["matrix"]["mean"]) == (2, 2)
-    with sqlite3.connect(root / "whole" / "mlflow.db") as store:
+    with sqlite3.connect(root / "mlflow.db") as store:
         statuses = [status for (status,) in store.execute("select status from runs")]
         points = dict(store.execute("select key, count(*) from metrics group by key"))
     assert statuses == ["FINISHED"] * 3  # the population, and each member nested in it

@@ -91,7 +91,19 @@ def test_compare_gives_tables_charts_and_mlflow_metrics_by_number_of_agents(run:
         return sorted((point.step, point.value) for point in points)
 
     lipo = f"lipo/{CRAMPED}/s0"
-    assert history(lipo, SCALING_METRIC) == [(1, 800), (2, 2000)]
+    assert history(lipo, SCALING_METRIC) == [(0, 0), (1, 800), (2, 2000)]
+    assert history("comparison", f"environment_steps/{lipo}") == [(0, 0), (1, 800), (2, 2000)]
+    parent = found["comparison"].info.run_id
+    assert all(found[name].data.tags["mlflow.parentRunId"] == parent for name in found if name != "comparison")
+    assert all(
+        any(point.value for point in client.get_metric_history(one.info.run_id, metric))
+        for one in found.values()
+        for metric in one.data.metrics
+    )  # no empty charts
+    assert (
+        all(one.data.metrics for one in found.values())
+        and "get-artifact" in (found["comparison"].data.tags["mlflow.note.content"])
+    )
     assert history(lipo, f"{SCALING_METRIC}_extrapolated") == []
     assert history(lipo, "XP_steps_by_members") == [(1, 0), (2, 400)]
     assert history(lipo, "seconds_by_members") == [(1, 60), (2, 120)]

@@ -219,7 +219,7 @@ def test_the_population_holds_both_members_and_their_steps(whole: Run) -> None:
 def test_the_mlflow_run_holds_what_the_run_leaves_behind(whole: Run, tmp_path: Path) -> None:
     from mlflow.tracking import MlflowClient
 
-    client = MlflowClient(tracking_uri=f"sqlite:///{whole.dir}/mlflow.db")
+    client = MlflowClient(tracking_uri=f"sqlite:///{whole.dir.parent}/mlflow.db")
     runs = json.loads((whole.dir / "tracking.json").read_text())["runs"]
     assert runs.keys() == {"parent", "member_001", "member_002"}
     assert {client.get_run(run).info.status for run in runs.values()} == {"FINISHED"}

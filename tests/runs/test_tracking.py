@@ -11,7 +11,7 @@ import pytest
 from popgen.config.sections import TrackingConfig
 from popgen.errors import UserError
 from popgen.methods.xpm_wm.config import XpmWmRun
-from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker
+from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker, choose_store, view_address
 
 
 def history(tracker: Tracker, run: str, metric: str) -> list[tuple[int, float]]:
@@ -35,7 +35,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     first = Tracker(TrackingConfig(), folder, "run-1", XpmWmRun().model_dump(mode="json"))
     for step in range(1250):
         first.log({"loss": step / 2, "score": 1.0}, step=step, member=1)
-    first.log_scaling(1, 600_000)
+    first.log_scaling(1, 600_000, {"SP": 500_000, "random": 100_000, "MP": 0})
     first.log_artifact(folder / "report", "report")
     first.log_artifact(folder / "report" / "matrix.json", member=1)
     first.flush()
@@ -43,13 +43,15 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracker:
     second = Tracker(TrackingConfig(), folder, "run-1", XpmWmRun().model_dump(mode="json"), resume=state)
     second.log({"loss": 9.0}, step=1250, member=1)
     second.log({"loss": math.nan}, step=0, member=2)
-    second.log_scaling(2, 660_000)
+    second.log_scaling(2, 660_000, {"SP": 550_000, "random": 100_000, "XP": 10_000})
     second.finish()
     return second
 
 
 def test_everything_lies_in_the_run_folder(tracked: Tracker) -> None:
-    assert {"mlflow.db", "mlflow_artifacts", "report"} == {path.name for path in tracked.run_dir.iterdir()}
+    assert {".mlflow.db.lock", "mlflow.db", "mlflow_artifacts", "report"} == {
+        path.name for path in tracked.run_dir.iterdir()
+    }
     assert [file.path for file in client(tracked).list_artifacts(tracked.state()["runs"]["parent"])] == ["report"]
     assert len(list(tracked.run_dir.rglob("mlflow_artifacts/**/matrix.json"))) == 2
 
@@ -74,7 +76,50 @@ def test_metrics_of_both_sittings_are_there(tracked: Tracker) -> None:
 
 
 def test_scaling_has_the_number_of_members_as_step(tracked: Tracker) -> None:
-    assert history(tracked, "parent", SCALING_METRIC) == [(1, 600_000.0), (2, 660_000.0)]
+    assert history(tracked, "parent", SCALING_METRIC) == [(0, 0.0), (1, 600_000.0), (2, 660_000.0)]
+    assert history(tracked, "parent", "environment_steps/SP") == [(0, 0.0), (1, 500_000.0), (2, 550_000.0)]
+    assert history(tracked, "parent", "environment_steps/XP") == [(0, 0.0), (2, 10_000.0)]
+    assert history(tracked, "parent", "environment_steps/MP") == []  # a kind that nobody used is no chart
+
+
+def test_members_have_parameters_and_tags_too(tracked: Tracker) -> None:
+    for run in tracked.state()["runs"].values():
+        data = client(tracked).get_run(run).data
+        assert data.params["agent.lambda_xp"] == str(XpmWmRun().agent.lambda_xp)
+        tags = {name: data.tags[f"popgen.{name}"] for name in ("method", "layout", "seed", "scale")}
+        assert tags == {"method": "xpm_wm", "layout": XpmWmRun().env.name, "seed": "0", "scale": "laptop"}
+
+
+def test_single_events_are_folded_away(tmp_path: Path) -> None:
+    tracker = Tracker(TrackingConfig(), tmp_path, "r")
+    figures = ["report/precision_takes_dish_step1", "recall_takes_dish_step4", "report/event_recall_step1", "recall"]
+    tracker.log(dict.fromkeys(figures, 1.0), step=1, member=1)
+    tracker.finish()
+    assert set(client(tracker).get_run(tracker.state()["runs"]["member_001"]).data.metrics) == set(figures[2:])
+
+
+def test_runs_of_one_root_have_one_store_and_descriptions(tmp_path: Path) -> None:
+    assert choose_store(tmp_path / "a") == tmp_path and choose_store(tmp_path / "a", "s3://b/c") == tmp_path / "a"
+    trackers = [Tracker(TrackingConfig(), tmp_path / name, name, store=tmp_path) for name in ("a", "b")]
+    assert len({tracker.uri for tracker in trackers}) == 1 and not (tmp_path / "a").exists()
+    for tracker in trackers:
+        tracker.describe(f"![SP](artefact:report/x.png) {tracker.run_name}" + "." * 9000, "| all |")
+        tracker.finish()
+    found = client(trackers[0]).search_runs([trackers[0].state()["experiment"]])
+    notes = {run.info.run_name: run.data.tags["mlflow.note.content"] for run in found}
+    for tracker in trackers:
+        address = f"get-artifact?run_uuid={tracker.run_id}&path=report/x.png"
+        assert notes[tracker.run_name].startswith(f"![SP]({address}) {tracker.run_name}")
+        assert len(notes[tracker.run_name]) == 5000
+        place = f"experiments/{tracker.state()['experiment']}/runs/{tracker.run_id}"
+        assert view_address(tracker.state(), "x") == f"x/#/{place}?workflowType=machine_learning"
+    assert (
+        client(trackers[0]).get_experiment(trackers[0].state()["experiment"]).tags["mlflow.note.content"] == "| all |"
+    )
+    assert view_address({}) == "http://127.0.0.1:5000/#/experiments?workflowType=machine_learning"
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "mlflow.db").touch()
+    assert choose_store(tmp_path / "a") == tmp_path / "a"  # of a version that kept it there
 
 
 def test_points_go_out_in_batches(tmp_path: Path) -> None:
@@ -162,7 +207,12 @@ def test_off_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     tracker.log_scaling(1, 10)
     tracker.log_artifact(tmp_path)
     tracker.finish()
-    assert not tracker.enabled and tracker.state() == {"runs": {}} and list(tmp_path.iterdir()) == []
+    assert (
+        not tracker.enabled
+        and tracker.state()["runs"] == {}
+        and tracker.run_id is None
+        and list(tmp_path.iterdir()) == []
+    )
 
 
 def test_a_store_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:

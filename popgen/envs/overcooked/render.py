@@ -95,7 +95,7 @@ def as_rgb(kitchen: Kitchen, row: np.ndarray) -> np.ndarray:
         if layout.tile(cell) == "P":
             _cut_tile(picture, cell)[:] = _paint_pot(code, cooking)
         elif code:
-            _draw_item(_cut_tile(picture, cell), code, 16, 16)
+            _cut_tile(picture, cell)[:] = _paint_counter(code)
     for i in (0, 1):
         cell = (int(row[i]) % layout.width, int(row[i]) // layout.width)
         _cut_tile(picture, cell)[:] = _paint_player(i, int(row[k.ORIENT + i]) & 3, int(row[k.HELD + i]))
@@ -149,6 +149,14 @@ def _draw_soup(tile: np.ndarray, code: int, x: float, y: float, radius: float) -
         angle = 2.1 * i - 1.57
         where = x + radius * 0.5 * np.cos(angle), y + radius * 0.5 * np.sin(angle)
         _draw_disc(tile, *where, radius * 0.35, COLOURS[name])
+
+
+@lru_cache(maxsize=64)
+def _paint_counter(code: int) -> np.ndarray:
+    """A counter (32, 32, 3) and what lies on it."""
+    tile = _paint_ground("X").copy()
+    _draw_item(tile, code, 16, 16)
+    return tile
 
 
 @lru_cache(maxsize=4096)

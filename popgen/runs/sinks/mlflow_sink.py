@@ -24,8 +24,11 @@ class TrackerClient(Protocol):
     def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
         """Metrics of the population (member None) or of one member."""
 
-    def log_scaling(self, members: int, environment_steps: int) -> None:
-        """Environment steps so far, with step = number of members."""
+    def log_scaling(self, members: int, environment_steps: int, kinds: Mapping[str, int] | None = None) -> None:
+        """Environment steps so far, in all and by kind, with step = number of members."""
+
+    def describe(self, text: str, overview: str = "") -> None:
+        """Markdown of the run and of its experiment."""
 
     def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
         """Copy a file or folder."""
@@ -50,8 +53,11 @@ class NoTracker:
     def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
         """Ignore metrics."""
 
-    def log_scaling(self, members: int, environment_steps: int) -> None:
-        """Ignore the figure."""
+    def log_scaling(self, members: int, environment_steps: int, kinds: Mapping[str, int] | None = None) -> None:
+        """Ignore the figures."""
+
+    def describe(self, text: str, overview: str = "") -> None:
+        """Ignore the text."""
 
     def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
         """Ignore the file."""
@@ -91,7 +97,7 @@ class MlflowSink(Sink):
 
     def on_member(self, added: MemberAdded) -> None:
         """One more point of the scaling figure."""
-        self.tracker.log_scaling(added.member, added.total_steps)
+        self.tracker.log_scaling(added.member, added.total_steps, added.kinds)
         self.save_runs()
 
     def on_end(self, status: str) -> None:

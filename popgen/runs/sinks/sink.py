@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from popgen.types import LedgerEntry
 
@@ -35,12 +35,14 @@ class MemberAdded:
         steps: environment steps of its training.
         total_steps: of all members so far.
         following: the member that is trained next, None after the last one.
+        kinds: of all members so far by kind, simulated ones among them.
     """
 
     member: int
     steps: int
     total_steps: int
     following: int | None
+    kinds: Mapping[str, int] = field(default_factory=dict)
 
 
 class Sink:
