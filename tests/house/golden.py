@@ -75,10 +75,12 @@ def kill_halfway(checkout: Path, command: list[str], out: Path, ledger: Path, ro
 def read_figures(folder: Path, report: Figures) -> Figures:
     """Digests of weights, ledger and matrix of a finished run.
 
-    The ledger counts without the samplers' names and running numbers, which tell the attempts of a run apart.
+    The ledger counts without the samplers' names and running numbers, which tell the attempts of a run apart, and
+    without evaluations, whose steps are told beside those of training.
     """
     rows = [json.loads(line) for line in (folder / "ledger.jsonl").read_text().splitlines()]
-    kept = sorted(json.dumps([row[name] for name in ("member", "kind", "steps", "episodes", "score")]) for row in rows)
+    names = ("member", "kind", "steps", "episodes", "score")
+    kept = sorted(json.dumps([row[name] for name in names]) for row in rows if row["kind"] != "evaluation")
     steps: Counter[str] = Counter()
     for row in rows:
         steps[f"member {row['member']} {row['kind']}"] += row["steps"]

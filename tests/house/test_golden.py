@@ -46,4 +46,7 @@ def test_the_ledgers_digest_knows_no_attempts(tmp_path: Path) -> None:
         row = {"run": name, "member": 1, "kind": "SP", "sampler": sampler, "sequence": 0, "steps": 8}
         (folder / "ledger.jsonl").write_text(json.dumps({**row, "episodes": 1, "score": 0.5}) + "\n")
         digests.append(read_figures(folder, {"matrix": {"mean": [[1.0]]}}))
+        with (folder / "ledger.jsonl").open("a") as file:
+            file.write(json.dumps({**row, "kind": "evaluation", "episodes": 1, "score": float(len(digests))}) + "\n")
+        assert read_figures(folder, {"matrix": {"mean": [[1.0]]}})["ledger"] == digests[-1]["ledger"]
     assert digests[0] == digests[1] and digests[0]["steps"] == {"member 1 SP": 8}
