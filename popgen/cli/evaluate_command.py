@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +16,13 @@ from popgen.errors import UserError
 if TYPE_CHECKING:
     from popgen.evaluation.holdout import Casting
     from popgen.population.manifest import EnvironmentInfo
+    from popgen.progress import Reporter
 
 MATRIX_EPISODES, HOLDOUT_EPISODES = 20, 40
 """Defaults: for each ordered pair of members; for each ego, partner and seat."""
 
 _MATRIX_ONLY = ("members", "env", "param")
-_HOLDOUT_ONLY = ("human", "control")
+_HOLDOUT_ONLY = ("human", "control", "best_responses", "response_set", "responses")
 _NAMED = "[NAME=]POPULATION"
 
 
@@ -54,6 +56,19 @@ def add(commands: Any) -> None:
         "--human", metavar=_NAMED, nargs="+", action="extend", type=named_path, help="human proxies as partners"
     )
     parser.add_argument("--control", metavar="NAME", help="an ego over which the others' margins are told")
+    parser.add_argument(
+        "--best-responses", action="store_true", help="train the best responses that are missing to all partners first"
+    )
+    parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
+    parser.add_argument(
+        *("--response-set",),
+        nargs="+",
+        action="extend",
+        type=pair,
+        default=[],
+        metavar="KEY=VALUE",
+        help="settings of their training, such as scale=demo",
+    )
     told = f"per ordered pair ({MATRIX_EPISODES}), or per ego, partner and seat ({HOLDOUT_EPISODES})"
     parser.add_argument("--episodes", type=at_least(1), default=None, help=told)
     parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation (%(default)s)")
@@ -72,7 +87,8 @@ def evaluate(args: argparse.Namespace) -> int:
     for name in _MATRIX_ONLY if together else _HOLDOUT_ONLY:
         if getattr(args, name):
             without = "without" if together else "with"
-            raise UserError(f"--{name}", f"is of an evaluation {without} --with", "leave it out")
+            option = f"--{name.replace('_', '-')}"
+            raise UserError(option, f"is of an evaluation {without} --with", "leave it out")
     if together:
         return _evaluate_egos(args)
     if len(args.populations) > 1:
@@ -129,6 +145,7 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     out = Path(args.out or "holdout")
     check_root(out, 64 * 2**20, "--out")
     with closing(make_reporter(quiet=args.quiet)) as reporter:
+        casting = _respond(casting, args, reporter)
         reporter.phase("evaluation", 1)
         result = evaluate_holdout(
             casting,
@@ -146,6 +163,17 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     tables = [sheet.to_rich() for sheet in to_sheets(report)]
     print_report(tables, list_lines(report), str(out), [path.name for path in files.values()], width=80)
     return OK
+
+
+def _respond(casting: Casting, args: argparse.Namespace, reporter: Reporter) -> Casting:
+    """The same players with the best responses to the partners, trained first where that is asked for."""
+    from popgen.pipelines.best_responses import find_responses, train_responses
+
+    settings = dict(args.response_set)
+    if args.best_responses:
+        scale = str(settings.pop("scale", "laptop"))
+        train_responses(casting.partners, args.responses, settings, reporter, scale=scale)
+    return replace(casting, responses=find_responses(casting.partners, args.responses))
 
 
 def _cast_players(args: argparse.Namespace) -> tuple[Casting, EnvironmentInfo]:

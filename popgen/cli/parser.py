@@ -10,6 +10,7 @@ from popgen.cli import bench_commands as bench
 from popgen.cli import compare_command as comparison
 from popgen.cli import config_command as configuration
 from popgen.cli import conventions_command as conventions
+from popgen.cli import diversity_command as diversity
 from popgen.cli import ego_commands as ego
 from popgen.cli import evaluate_command as evaluation
 from popgen.cli import experiment_commands as experiments
@@ -57,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
     for subject in (
-        *(run, sweep, configuration, evaluation, population, ego, play, comparison),
+        *(run, sweep, configuration, evaluation, diversity, population, ego, play, comparison),
         *(experiments, humans, conventions, bench),
     ):
         subject.add(commands)

@@ -1,0 +1,70 @@
+"""`popgen diversity`: how diverse partners are, and which of them are the most diverse."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from popgen.cli.arguments import add_command, at_least, named_path
+from popgen.cli.printing import OK, print_json, print_report
+from popgen.cli.training import bound_threads
+from popgen.errors import UserError
+
+
+def add(commands: Any) -> None:
+    """`diversity`."""
+    parser = add_command(
+        commands,
+        "diversity",
+        measure,
+        "BR-Div of partners (determinant, its logarithm, effective rank), and the most diverse K of them",
+        "Over the events of the partners in play with themselves, and of their best responses beside them where all "
+        "have one (popgen evaluate --best-responses trains them). Keys of --json: those of "
+        "popgen/reports/diversity_report.py and files.",
+    )
+    parser.add_argument(
+        *("populations",), metavar="[NAME=]POPULATION", nargs="+", type=named_path, help="partners, of one environment"
+    )
+    parser.add_argument("--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them")
+    parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
+    parser.add_argument("--episodes", type=at_least(1), default=20, help="for each partner and seat (%(default)s)")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="(%(default)s)")
+    parser.add_argument("--out", default="diversity", metavar="DIR", help="of the report (%(default)s)")
+
+
+def measure(args: argparse.Namespace) -> int:
+    """Play, count and write the report."""
+    bound_threads(1)
+    from popgen.envs import make_env
+    from popgen.evaluation.holdout_players import open_sides
+    from popgen.evaluation.partner_diversity import measure_partners
+    from popgen.pipelines.best_responses import find_responses
+    from popgen.reports.diversity_report import describe_diversity, list_lines, make_sheet, write_report
+    from popgen.reports.method_titles import title_of
+    from popgen.runs.preflight import check_root
+
+    opened = open_sides({"partner": args.populations}, title_of)
+    groups = opened.sides["partner"]
+    players = [player for group in groups for player in group.players]
+    if args.choose is not None and args.choose > len(players):
+        raise UserError("--choose", f"is {args.choose}, there are {len(players)} partners", "choose fewer")
+    check_root(Path(args.out), 16 * 2**20, "--out")
+    found = find_responses(groups, args.responses)
+    responses = [found[player.digest or ""] for player in players if (player.digest or "") in found]
+    environment = opened.environment
+
+    def make(num_envs: int, seed: int) -> Any:
+        return make_env(environment.name, num_envs, seed=seed, **environment.params)
+
+    measured = {"members": measure_partners(make, players, None, args.episodes, args.seed, choose=args.choose)}
+    if len(responses) == len(players):
+        over = measure_partners(make, players, responses, args.episodes, args.seed, choose=args.choose)
+        measured["best responses"] = over
+    report = describe_diversity(environment, args.episodes, args.seed, measured, len(responses))
+    files = write_report(report, args.out)
+    if args.json:
+        print_json({**report, "files": {name: str(path) for name, path in files.items()}})
+        return OK
+    print_report([make_sheet(report).to_rich()], list_lines(report), args.out, files, width=80)
+    return OK

@@ -1,0 +1,114 @@
+"""How diverse partners are: BR-Div over what they do, and over what their best responses have to do.
+
+The counts are those of HSP's events of transitions, per episode, as in ZSC-Eval (Wang et al. 2024). In environments
+without these the environment's own events take their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from popgen.envs.contract import BatchedEnv
+from popgen.envs.overcooked import OvercookedEnv
+from popgen.envs.overcooked.transition_events import find_transition_events, hsp_events
+from popgen.evaluation.holdout_metrics import Diversity, choose_most_diverse, measure_diversity
+from popgen.evaluation.holdout_players import Player
+from popgen.play.policy import Policy
+from popgen.play.rollout import Transition, play
+
+
+@dataclass(frozen=True)
+class PartnerDiversity:
+    """BR-Div of some partners.
+
+    Attributes:
+        players: K partners.
+        counts: (K, F) mean counts of an episode.
+        diversity: of all.
+        chosen: indices of the most diverse ones that were asked for, ascending.
+        chosen_diversity: of these.
+        steps: environment steps taken.
+    """
+
+    players: tuple[Player, ...]
+    counts: np.ndarray
+    diversity: Diversity
+    chosen: tuple[int, ...]
+    chosen_diversity: Diversity
+    steps: int
+
+
+class _EventCounter:
+    """Sums the events of every row and seat over its episode."""
+
+    def __init__(self, env: BatchedEnv) -> None:
+        self.env, self.counts = env, np.zeros(0)
+
+    def __call__(self, step: Transition) -> None:
+        if isinstance(self.env, OvercookedEnv):
+            events = hsp_events(find_transition_events(self.env, step.states, step.actions).astype(np.int64))
+        else:
+            events = step.result.events.astype(np.int64)
+        events = events * step.counted[:, None, None]
+        self.counts = events if not self.counts.size else self.counts + events
+
+
+def count_events(
+    make: Callable[[int, int], BatchedEnv],
+    players: Sequence[Player],
+    responses: Sequence[Player] | None,
+    episodes: int,
+    seed: int,
+) -> tuple[np.ndarray, int]:
+    """(K, F) mean counts of an episode, and the environment steps taken.
+
+    Args:
+        make: (num_envs, seed) -> environment.
+        players: K partners.
+        responses: their best responses, whose events beside them are counted, in both seats; None counts those of the
+            partners in play with themselves.
+        episodes: N for each partner and seat.
+        seed: same arguments, same result.
+    """
+    policies: list[Policy] = [player.make() for player in players]
+    others = range(len(players))
+    if responses is not None:
+        others = range(len(players), 2 * len(players))
+        policies += [player.make() for player in responses]
+    # The one whose events count sits in seat 0, then in seat 1.
+    matches = [seats for k, one in enumerate(others) for seats in ((one, k), (k, one))]
+    env = make(len(matches) * episodes, 0)
+    counter = _EventCounter(env)
+    played = play(env, policies, np.repeat(np.array(matches), episodes, axis=0), seed=seed, record=counter)
+    table = counter.counts.reshape(len(players), 2, episodes, 2, -1)
+    own = np.stack([table[:, seat, :, seat] for seat in (0, 1)], 1)
+    return own.mean((1, 2)), played.steps
+
+
+def measure_partners(
+    make: Callable[[int, int], BatchedEnv],
+    players: Sequence[Player],
+    responses: Sequence[Player] | None,
+    episodes: int,
+    seed: int,
+    *,
+    choose: int | None = None,
+) -> PartnerDiversity:
+    """BR-Div of partners, and of the `choose` most diverse ones (all without it); see `count_events`.
+
+    Raises:
+        ValueError: more are to be chosen than there are.
+    """
+    counts, steps = count_events(make, players, responses, episodes, seed)
+    chosen = choose_most_diverse(counts, len(players) if choose is None else choose)
+    return PartnerDiversity(
+        players=tuple(players),
+        counts=counts,
+        diversity=measure_diversity(counts),
+        chosen=tuple(chosen),
+        chosen_diversity=measure_diversity(counts[chosen]),
+        steps=steps,
+    )
