@@ -56,6 +56,19 @@ def add(commands: Any) -> None:
         "--human", metavar=_NAMED, nargs="+", action="extend", type=named_path, help="human proxies as partners"
     )
     parser.add_argument("--control", metavar="NAME", help="an ego over which the others' margins are told")
+    _add_responses(parser)
+    told = f"per ordered pair ({MATRIX_EPISODES}), or per ego, partner and seat ({HOLDOUT_EPISODES})"
+    parser.add_argument("--episodes", type=at_least(1), default=None, help=told)
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation (%(default)s)")
+    parser.add_argument("--members", type=numbers, default=None, metavar="1,2,...", help="all by default")
+    parser.add_argument("--out", metavar="DIR", help="of the report (POPULATION/evaluation, with --with: holdout)")
+    parser.add_argument("--env", metavar="NAME", help="refuse a population that was trained in another environment")
+    parser.add_argument(
+        "--param", type=pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
+    )
+
+
+def _add_responses(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--best-responses", action="store_true", help="train the best responses that are missing to all partners first"
     )
@@ -68,15 +81,6 @@ def add(commands: Any) -> None:
         default=[],
         metavar="KEY=VALUE",
         help="settings of their training, such as scale=demo",
-    )
-    told = f"per ordered pair ({MATRIX_EPISODES}), or per ego, partner and seat ({HOLDOUT_EPISODES})"
-    parser.add_argument("--episodes", type=at_least(1), default=None, help=told)
-    parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation (%(default)s)")
-    parser.add_argument("--members", type=numbers, default=None, metavar="1,2,...", help="all by default")
-    parser.add_argument("--out", metavar="DIR", help="of the report (POPULATION/evaluation, with --with: holdout)")
-    parser.add_argument("--env", metavar="NAME", help="refuse a population that was trained in another environment")
-    parser.add_argument(
-        "--param", type=pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
     )
 
 
