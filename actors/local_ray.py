@@ -12,7 +12,7 @@ from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.runs.interruption import end_on_sigterm
 from popgen.runs.ray_folder import make_ray_folder
-from popgen.runs.resources import demands, total
+from popgen.runs.resources import count_cores, demands, total
 
 STARTS = 4
 LATE = "timed out during startup"
@@ -34,7 +34,7 @@ def start_ray(config: RunConfig) -> bool:
         # Without an address Ray would look for a running cluster before it starts a local one.
         "address": "local" if local else cluster.address,
         # On fewer cores than the actors ask for they take turns.
-        "num_cpus": cluster.num_cpus or max(os.cpu_count() or 1, math.ceil(wanted)) if local else None,
+        "num_cpus": cluster.num_cpus or max(count_cores(), math.ceil(wanted)) if local else None,
         "include_dashboard": False if local else None,
         "log_to_driver": False,
         "logging_level": "ERROR",

@@ -2,7 +2,8 @@
 # What a popgen container does, by its first word:
 #   head [OPTION...]       the head of a Ray cluster; options are those of `ray start`
 #   worker [OPTION...]     a node that joins the cluster at RAY_HEAD (HOST:PORT)
-#   run [KEY=VALUE...]     generate a population: as a job of the cluster at RAY_API_SERVER_ADDRESS, or on its own
+#   run [KEY=VALUE...]     generate a population: as a job of the cluster at RAY_API_SERVER_ADDRESS (with
+#                          cluster=POPGEN_CLUSTER, nodes without it), or on its own
 #   mlflow [OPTION...]     a tracking server that keeps everything in MLFLOW_DATA
 #   health ROLE            exit code 0 if this container's head, worker or mlflow answers
 # and any other command of popgen (evaluate, show, runs, bench, --help).
@@ -60,7 +61,7 @@ case "$role" in
     run)
         [[ -n "${RAY_API_SERVER_ADDRESS:-}" ]] || exec popgen run "$@"
         need_token
-        exec ray job submit -- popgen run cluster=nodes "$@"
+        exec ray job submit -- popgen run cluster="${POPGEN_CLUSTER:-nodes}" "$@"
         ;;
     mlflow)
         data="${MLFLOW_DATA:-$HOME/mlflow}"

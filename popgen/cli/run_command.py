@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, compose_record, to_yaml
 from popgen.cli.printing import OK, WEAK, print_json, print_table
+from popgen.cli.standard_streams import keep_native_lines
 from popgen.cli.training import before_ray, tell_notes
 from popgen.durable_files import read_regular
 from popgen.errors import UserError
@@ -84,6 +85,8 @@ def execute(config: RunConfig, args: argparse.Namespace) -> int:
         tell_notes(spec.notes)
     if args.dry_run:
         return _print_config(config.as_dict(), args.json)
+    if args.own_process:
+        keep_native_lines(native_lines(run_folder(config)))
     before_ray(config.cluster.threads, config.cluster.address is None)
     from popgen.pipelines.population import run_population
 
@@ -111,6 +114,12 @@ def read_record(run: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise UserError("--from", f"{path} holds no settings", "give a run's folder")
     return values
+
+
+def native_lines(folder: Path) -> Path:
+    """Where Ray's C++ lines go: beside the run's folder, which a copy from a storage may still have to take the place
+    of."""
+    return folder.with_name(f".{folder.name}.ray.log")
 
 
 def _print_config(values: dict[str, Any], as_json: bool) -> int:

@@ -11,7 +11,11 @@ import select
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
+
+_KEPT: list[tuple[int, Path]] = []
+"""The number under which the stderr of before is kept, and the file in its place, while `keep_native_lines` holds."""
 
 _GONE = (errno.EPIPE, errno.EIO, errno.EBADF)
 """Nobody will ever read what is written there: a pipe without a reader, a terminal that was closed."""
@@ -52,6 +56,35 @@ class ProgressStream:
                 _point_to_null(self._stream.fileno())
 
 
+def keep_native_lines(path: Path) -> None:
+    """From here on, what libraries in other languages write to stderr goes to a file; what Python writes stays seen.
+
+    Ray's C++ tells of processes that come and go, with addresses and stacks, which says nothing to a user. The way it
+    was comes back where `mend_streams` ends.
+    """
+    if not _KEPT:
+        kept = os.dup(2)
+        _KEPT.append((kept, path))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        sys.stderr.flush()
+        os.dup2(file, 2)
+        os.close(file)
+        seen = open(kept, "w", encoding="utf-8", errors="backslashreplace", buffering=1, closefd=False)  # noqa: SIM115
+        sys.stderr = ProgressStream(seen)  # type: ignore[assignment]
+
+
+def _return_stderr() -> None:
+    if _KEPT:
+        sys.stderr.flush()
+        kept, path = _KEPT.pop()
+        os.dup2(kept, 2)
+        os.close(kept)
+        with suppress(OSError):
+            if not path.stat().st_size:
+                path.unlink()
+
+
 @contextmanager
 def mend_streams() -> Iterator[None]:
     """Within it the three standard streams are there and open, and stderr is a `ProgressStream`."""
@@ -65,6 +98,7 @@ def mend_streams() -> Iterator[None]:
         yield
     finally:
         sys.stderr.flush()
+        _return_stderr()
         sys.stderr = before
         try:
             sys.stdout.flush()

@@ -18,7 +18,7 @@ from popgen.methods.method import Continuation, Method, Needs
 from popgen.methods.registry import METHODS
 from popgen.runs import sizes
 from popgen.runs.ray_folder import check_ray_folder
-from popgen.runs.resources import demands, total
+from popgen.runs.resources import MOST_ON_A_CORE, count_cores, demands, total
 from popgen.runs.tracking_address import check_uri
 
 RAYS_SHARE = 0.3
@@ -143,6 +143,14 @@ def check_cluster(config: RunConfig) -> None:
     cluster = config.cluster
     if cluster.address is not None:
         return
+    cores = cluster.num_cpus or count_cores()
+    for demand in demands(config):
+        if demand.count > MOST_ON_A_CORE * cores:
+            number = "ppo.runners" if hasattr(config, "ppo") else "cluster.samplers"
+            setting = number if demand.field == "cluster.sampler_cpus" else demand.field
+            problem = f"{demand.count} processes on {cores} core{'s' * (cores > 1)} would wait for each other"
+            fix = f"ask for at most {MOST_ON_A_CORE * cores}, or set cluster.num_cpus to what the machine can bear"
+            raise UserError(setting, problem, fix)
     needed = total(demands(config))
     cpus, have = needed.pop("CPU", 0.0), cluster.num_cpus
     if have is not None and have < cpus:

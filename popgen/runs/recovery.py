@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +24,9 @@ ACTOR_FAILURES = (
     exceptions.RpcError,
     exceptions.RaySystemError,
 )
+TELL_SECONDS = 60.0
+"""Between two lines of a run that waits for nodes."""
+
 FULL = {
     exceptions.ObjectStoreFullError: (
         "cluster.object_store_bytes",
@@ -107,15 +111,18 @@ def wait_for_room(config: RunConfig, tell: Callable[[str], None], clock: Callabl
     Raises:
         UserError: there is none within `cluster.wait_seconds`.
     """
-    began, pause, wanted = clock(), 0.1, demands(config)
+    began, pause, wanted, told = clock(), 0.1, demands(config), -math.inf
     while True:
         try:
             return check_room(wanted, [node["Resources"] for node in ray.nodes() if node["Alive"]])
         except UserError as error:
-            if clock() - began >= config.cluster.wait_seconds:
+            now = clock()
+            left = config.cluster.wait_seconds - (now - began)
+            if left <= 0:
                 raise
-            if pause == 0.1:
-                tell(f"waiting for nodes: {error.problem}")
+            if now - told >= TELL_SECONDS:
+                told = now
+                tell(f"waiting {left:.0f} s at most for nodes: {error.problem}; {error.fix}")
         time.sleep(pause)
         pause = min(5.0, 2 * pause)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
@@ -12,6 +13,14 @@ from popgen.methods.method import ActorDemand
 from popgen.methods.registry import METHODS
 
 ROUNDING = 1e-9
+
+MOST_ON_A_CORE = 4
+"""Processes of one kind that a core of this machine may be shared by."""
+
+
+def count_cores() -> int:
+    """Cores that this process may use: those of a batch job, not of its node."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def demands(config: RunConfig) -> list[ActorDemand]:
@@ -33,10 +42,16 @@ def check_room(wanted: Sequence[ActorDemand], nodes: Sequence[Mapping[str, float
     Raises:
         UserError: all nodes have less than all actors ask for, or those of a kind do not fit on them.
     """
-    for name, amount in total(wanted).items():
-        if amount > (have := sum(node.get(name, 0.0) for node in nodes)) + ROUNDING:
-            problem = f"the actors ask for {amount:g} {name}, the cluster has {have:g}"
-            raise UserError("cluster", problem, "ask for less, or wait until its nodes are up")
+    have = {name: sum(node.get(name, 0.0) for node in nodes) for name in total(wanted)}
+    missing = [
+        f"{amount:g} {name}, the cluster has {have[name]:g}"
+        for name, amount in total(wanted).items()
+        if amount > have[name] + ROUNDING
+    ]
+    if missing:
+        fix = "ask for less, or wait until its nodes are up"
+        gpus = "cluster=cpu_nodes asks for no GPU; " if not have.get("GPU", 1.0) else ""
+        raise UserError("cluster", f"the actors ask for {'; for '.join(missing)}", gpus + fix)
     for demand in wanted:
         if (room := places(demand.amounts, nodes, demand.count)) < demand.count:
             each = " and ".join(f"{amount:g} {name}" for name, amount in demand.amounts.items())

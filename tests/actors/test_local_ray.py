@@ -27,7 +27,7 @@ def test_a_local_ray_has_room_for_all_actors(monkeypatch: pytest.MonkeyPatch) ->
     given: list[dict] = []
     monkeypatch.setattr(local_ray.ray, "is_initialized", lambda: False)
     monkeypatch.setattr(local_ray.ray, "init", lambda **options: given.append(options))
-    monkeypatch.setattr(local_ray.os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(local_ray, "count_cores", lambda: 1)
     for cluster in ({}, {"samplers": 12, "sampler_cpus": 1.0}, {"num_cpus": 7}):
         assert local_ray.start_ray(config(**cluster))
     assert [options["num_cpus"] for options in given] == [2, 14, 7]

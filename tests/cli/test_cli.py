@@ -79,6 +79,8 @@ BAD_OVERRIDES = {
     "reserved parameter": (["env.params.num_envs=1"], "env.params.num_envs"),
     "parameter of our own": (["env.params.self=1"], "env.params.self"),
     "seed of the environment alone": (["env.params.seed=1"], "set run.seed"),
+    "more samplers than the machine bears": (["cluster.samplers=4000"], "cluster.samplers: 4000 processes on"),
+    "more runners than it bears": (["method=lipo", "ppo.runners=4000", "ppo.envs=4000"], "ppo.runners: 4000 processes"),
     "fewer processors than actors ask for": (["cluster.num_cpus=1"], "the actors ask for 1.9"),
     "graphics cards that are not there": (["cluster.model_gpus=77"], "77 GPUs"),
     "resource of no local Ray": (["cluster.resources={tpu: 1}"], "cluster.resources.tpu"),

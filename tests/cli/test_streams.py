@@ -104,3 +104,42 @@ def test_another_broken_pipe_is_no_success(run: Any, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(population_commands, "show", lose_server)
     with pytest.raises(BrokenPipeError):
         run("show", ".")
+
+
+NATIVE = """
+import os, sys
+from pathlib import Path
+from popgen import cli
+from popgen.cli import population_commands
+from popgen.cli.standard_streams import keep_native_lines
+
+def work(args):
+    keep_native_lines(Path("kept", "native.log"))
+    os.write(2, b"*** C++ stack ***\\\\n" * int(sys.argv[2]))
+    print("progress", file=sys.stderr)
+    raise {"error": ValueError("ours"), "told": cli.UserError("a", "b")}[sys.argv[3]]
+
+population_commands.show = work
+sys.argv[1:1] = ["show"]
+args = sys.argv
+cli.parse = lambda argv: __import__("argparse").Namespace(command=work)
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.parametrize("lines", [0, 3])
+@pytest.mark.parametrize("end", ["error", "told"])
+def test_lines_of_other_languages_are_kept_apart(lines: int, end: str, tmp_path: Path) -> None:
+    program = NATIVE.replace("\\\\n", "\\n")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(lines), end],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert "C++" not in done.stderr and done.stderr.startswith("progress\n")
+    kept = tmp_path / "kept" / "native.log"
+    assert kept.exists() == bool(lines) and (not lines or kept.read_text().count("C++") == lines)
+    if end == "told":
+        assert (done.returncode, done.stderr) == (2, "progress\npopgen: error: a: b\n")
+    else:
+        assert done.returncode == 1 and "ValueError: ours" in done.stderr  # a traceback of ours is seen

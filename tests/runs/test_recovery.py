@@ -96,11 +96,27 @@ def test_nodes_are_waited_for_and_not_for_ever(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("ray.nodes", nodes)
     monkeypatch.setattr(recovery.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
     wait_for_room(config, said.append, clock=lambda: now[-1])
-    assert said == ["waiting for nodes: the actors ask for 1.9 CPU, the cluster has 1"] and len(now) == 3
+    (line,) = said
+    assert (
+        line.startswith("waiting 60 s at most for nodes: the actors ask for 1.9 CPU, the cluster has 1")
+        and len(now) == 3
+    )
     have[:] = [{"CPU": 1.0}]
     with pytest.raises(UserError, match="the actors ask for 1.9 CPU"):
         wait_for_room(config, said.append, clock=lambda: now[-1])
     assert now[-1] >= 60
+
+
+def test_a_long_wait_is_told_every_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    overrides = ("cluster.wait_seconds=200", "cluster.model_gpus=1", "cluster.samplers=2", "cluster.sampler_cpus=4")
+    config, said, now = RunConfig.parse(compose(["scale=smoke", *overrides])), [], [0.0]
+    monkeypatch.setattr("ray.nodes", lambda: [{"Alive": True, "Resources": {"CPU": 2.0}}])
+    monkeypatch.setattr(recovery.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
+    with pytest.raises(UserError) as caught:
+        wait_for_room(config, said.append, clock=lambda: now[-1])
+    for missing in ("9.8 CPU, the cluster has 2", "1 GPU, the cluster has 0", "cluster=cpu_nodes"):
+        assert missing in said[0] and missing in str(caught.value)
+    assert [line.split()[1] for line in said][0] == "200" and len(said) == 4
 
 
 def run_with(monkeypatch: pytest.MonkeyPatch, root: Path, attempts: list[Callable[[Any], None]], **cluster: Any) -> Any:
