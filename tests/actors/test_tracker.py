@@ -50,7 +50,7 @@ class FakeActor:
         if self.store.refuses:
             cause = UserError("tracking.uri", "cannot open it")
             return RayTaskError("open", "traceback", cause).as_instanceof_cause()
-        self.store.opened.append(arguments[-1])
+        self.store.opened.append(arguments[4])  # what to go on from; the folder of the store is last
 
     def _call(self, method: str, *arguments: Any) -> None:
         if method == "finish":
