@@ -74,7 +74,8 @@ def test_segments_replay_exactly_and_episodes_go_on_over_calls(make: Any) -> Non
         assert (env.time(segment.states[0]) == 0).all()
     if "rendezvous" in env.spec.name:
         whole = [joined(collected, match) for match in range(len(TEAMS))]
-        assert sum(s.terminated.sum() for s in whole) > 5 and sum(s.truncated.sum() for s in whole) > 5
+        assert sum(s.terminated.sum() for s in whole) > 10  # its horizon is an end like leaving the square
+        assert not any(s.truncated.any() for s in whole)
 
 
 def test_segments_carry_their_team_and_are_numbered() -> None:
