@@ -135,6 +135,7 @@ class PopulationJob:
         """Connect to a cluster and wait for its nodes, or start a local Ray, unless there is one."""
         if not self.uses_ray:
             return
+        self.reporter.phase("starting Ray", 0)
         self.mine = start_ray(self.config)
         if self.mine and self.config.cluster.address is not None:
             wait_for_room(self.config, self.reporter.note)
@@ -151,6 +152,7 @@ class PopulationJob:
         """All members that are missing; the workers end with the attempt."""
         config = self.config
         transport: Transport = RayTransport(config.cluster) if self.uses_ray else InlineTransport()
+        reporter.phase("starting workers", 0)
         training = open_training(config, self.spec, f"{recorder.run_id}.{recorder.attempt}", transport)
         try:
             checkpoints = open_checkpoints(config, recorder.dir, training, transport)
@@ -197,6 +199,7 @@ def open_checkpoints(config: RunConfig, root: Path, training: Training, transpor
 def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Reporter) -> dict[str, Any]:
     """Evaluate the population, write the report, return the summary (keys: see `run_population`)."""
     path = recorder.dir / "population"
+    reporter.expect(None)  # the last phase has an estimate of its own
     reporter.phase("evaluation", 1)
     result = evaluate_population(
         load_population(path),

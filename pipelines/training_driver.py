@@ -11,12 +11,32 @@ from pathlib import Path
 
 from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.config.run_config import RunConfig
-from popgen.methods.training import Checkpoint, Progress, Record, Round, State, TrainedMember, Training
+from popgen.methods.training import (
+    Checkpoint,
+    Phase,
+    PlannedPhase,
+    Progress,
+    Record,
+    Round,
+    State,
+    TrainedMember,
+    Training,
+)
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.runs.checkpoints import fitting, member_folder
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import wait_for_room
+from popgen.runs.run_estimate import RunEstimate
+
+EVALUATION, EVALUATION_SECONDS, EVALUATED_SECONDS = "evaluation", 3.0, 4e-5
+"""Its name, and what it takes on a laptop's core: in any case, and for each environment step."""
+
+
+def title_of_phase(phase: Phase, size: int) -> str:
+    """A phase as the user reads it, beside the number of members."""
+    whom = f"members {phase.member} to {phase.last}" if phase.last > phase.member else f"member {phase.member}"
+    return f"{whom} of {size}: {phase.name}"
 
 
 class TrainingDriver:
@@ -37,6 +57,11 @@ class TrainingDriver:
         self.config, self.recorder, self.reporter = config, recorder, reporter
         self.training, self.checkpoints = training, checkpoints
         self.running: tuple[int, ...] = ()
+        size = config.population.size
+        steps = size**2 * config.evaluation.episodes * training.spec.horizon
+        self.estimate = RunEstimate(
+            [*training.plan(), PlannedPhase(EVALUATION, size, EVALUATION_SECONDS + steps * EVALUATED_SECONDS)]
+        )
 
     def train_members(self) -> None:
         """All members that are missing.
@@ -79,13 +104,16 @@ class TrainingDriver:
             self._add_member(record)
             return False
         if not isinstance(record, Progress):
-            self.reporter.phase(record.name, record.total)
+            self.estimate.begin(record)
+            self.reporter.phase(title_of_phase(record, self.config.population.size), record.total)
             return False
         self._record_steps(record)
         self._record_figures(record)
         if record.note:
             self.reporter.note(record.note)
         if record.done is not None:
+            self.estimate.update(record.done)
+            self.reporter.expect(self.estimate.seconds_left())
             self.reporter.update(record.done, **record.shown)
         return isinstance(record, Round) and self._save_if_due(record)
 

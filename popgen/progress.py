@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, TextIO
@@ -12,6 +14,7 @@ from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
+    ProgressColumn,
     Task,
     TaskID,
     TaskProgressColumn,
@@ -19,15 +22,18 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 Figure = float | int | str
 
 SPEED_SECONDS = 600.0
 """The estimate of the time left takes the mean speed of so many seconds."""
 
-BAR_WIDTH = 10
-FIXED_WIDTH = BAR_WIDTH + 4 + 7 + 7 + 5
-"""Columns of a progress line beside its name and figures: bar, share, time passed, time left, gaps."""
+BAR_WIDTH, NARROW_BAR, WIDE = 10, 5, 100
+"""Columns of the bar, on terminals of at least `WIDE` columns and on others."""
+FIXED_WIDTH = 4 + 7 + 7 + 7
+"""Columns of a progress line beside its name, bar and figures: share, time passed, time left, gaps."""
+WHOLE_WIDTH = len("all 59 min")
 
 
 class Reporter(Protocol):
@@ -35,6 +41,9 @@ class Reporter(Protocol):
 
     def phase(self, name: str, total: float) -> None:
         """Begin a phase (and end the one before); `total` 0 means that its length is unknown."""
+
+    def expect(self, seconds: float | None) -> None:
+        """The whole work, of which this phase is a part, takes so many seconds more; None: nobody knows."""
 
     def update(self, done: float, **figures: Figure) -> None:
         """`done` of the phase's total; `figures` (steps, dishes, ...) stay until they are given again."""
@@ -51,6 +60,9 @@ class NullReporter:
 
     def phase(self, name: str, total: float) -> None:
         """Ignore the phase."""
+
+    def expect(self, seconds: float | None) -> None:
+        """Ignore the estimate."""
 
     def update(self, done: float, **figures: Figure) -> None:
         """Ignore the update."""
@@ -76,11 +88,31 @@ class PlainReporter:
     ) -> None:
         self.stream, self.every, self.clock = stream or sys.stderr, every, clock
         self._phase = PhaseClock("", 0, clock)
-        self._last = -float("inf")
+        self._last, self._heard = -float("inf"), clock()
+        self._expected: float | None = None
+        self._closed = threading.Event()
+
+    def break_silence(self) -> None:
+        """From now on a phase that says nothing for `every` seconds gets a line too, from a thread of its own."""
+
+        def watch() -> None:
+            while not self._closed.wait(self.every / 4):
+                self.tell_if_silent()
+
+        threading.Thread(target=watch, name="progress", daemon=True).start()
+
+    def tell_if_silent(self) -> None:
+        """A line about the phase, if there was none for `every` seconds."""
+        if self._phase.task.description and self.clock() - self._heard >= self.every:
+            self._print_phase()
 
     def phase(self, name: str, total: float) -> None:
         """See `Reporter.phase`."""
         self._phase, self._last = PhaseClock(name, total, self.clock), -float("inf")
+
+    def expect(self, seconds: float | None) -> None:
+        """See `Reporter.expect`."""
+        self._expected = None if seconds is None else self.clock() + seconds
 
     def update(self, done: float, **figures: Figure) -> None:
         """See `Reporter.update`."""
@@ -89,16 +121,22 @@ class PlainReporter:
         if now - self._last < self.every and not self._phase.task.finished:
             return
         self._last = now
-        self._print_line("  ".join(self._phase.describe()))
+        self._print_phase()
 
     def note(self, text: str) -> None:
         """See `Reporter.note`."""
         self._print_line(text)
 
     def close(self) -> None:
-        """Nothing to put away."""
+        """See `Reporter.close`."""
+        self._closed.set()
+
+    def _print_phase(self) -> None:
+        whole = [] if self._expected is None else [f"about {whole_text(self._expected - self.clock())} in all"]
+        self._print_line("  ".join(self._phase.describe() + whole))
 
     def _print_line(self, text: str) -> None:
+        self._heard = self.clock()
         print(text, file=self.stream, flush=True)
 
 
@@ -137,6 +175,15 @@ class PhaseClock:
         return parts
 
 
+class WholeColumn(ProgressColumn):
+    """The time that the whole work still takes, which counts down between two estimates."""
+
+    def render(self, task: Task) -> Text:
+        """Of a task whose field `expected` is the time of the end."""
+        expected = task.fields.get("expected")
+        return Text("" if expected is None else f"all {whole_text(expected - task.get_time())}")
+
+
 class RichReporter:
     """A live bar with phase, figures, time passed and time left, for terminals: rich's own columns.
 
@@ -144,28 +191,39 @@ class RichReporter:
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
+        console = Console(file=stream or sys.stderr)
+        bar = BAR_WIDTH if console.width >= WIDE else NARROW_BAR
         columns = (
             TextColumn("[bold]{task.description}"),
-            BarColumn(bar_width=BAR_WIDTH),
+            BarColumn(bar_width=bar),
             TaskProgressColumn(),
             TextColumn("{task.fields[figures]}", markup=False),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
+            WholeColumn(),
         )
-        console = Console(file=stream or sys.stderr)
+        self._fixed = bar + FIXED_WIDTH
         self._progress = Progress(*columns, console=console, speed_estimate_period=SPEED_SECONDS)
         self._task: TaskID | None = None
         self._room = 0
         self._figures: dict[str, Figure] = {}
+        self._expected: float | None = None
         self._progress.start()
 
     def phase(self, name: str, total: float) -> None:
         """See `Reporter.phase`."""
         if self._task is not None:
             self._progress.stop_task(self._task)
+            self._progress.update(self._task, expected=None)  # the last line has it
         self._figures = {}
-        self._room = self._progress.console.width - len(name) - FIXED_WIDTH
-        self._task = self._progress.add_task(escape(name), total=total or None, figures="")
+        self._room = self._progress.console.width - len(name) - self._fixed
+        self._task = self._progress.add_task(escape(name), total=total or None, figures="", expected=self._expected)
+
+    def expect(self, seconds: float | None) -> None:
+        """See `Reporter.expect`."""
+        self._expected = None if seconds is None else self._progress.get_time() + seconds
+        if self._task is not None:
+            self._progress.update(self._task, expected=self._expected)
 
     def update(self, done: float, **figures: Figure) -> None:
         """See `Reporter.update`."""
@@ -173,7 +231,8 @@ class RichReporter:
             return
         self._figures.update(figures)
         texts = [figure_text(name, value) for name, value in self._figures.items()]
-        self._progress.update(self._task, completed=done, figures=fit_texts(texts, self._room))
+        room = self._room - (WHOLE_WIDTH if self._expected is not None else 0)
+        self._progress.update(self._task, completed=done, figures=fit_texts(texts, room))
 
     def note(self, text: str) -> None:
         """See `Reporter.note`."""
@@ -189,7 +248,11 @@ def make_reporter(quiet: bool = False, stream: TextIO | None = None) -> Reporter
     shown = stream or sys.stderr
     if quiet:
         return NullReporter()
-    return RichReporter(shown) if shown.isatty() else PlainReporter(shown)
+    if shown.isatty():
+        return RichReporter(shown)
+    lines = PlainReporter(shown)
+    lines.break_silence()
+    return lines
 
 
 def figure_text(name: str, value: Figure) -> str:
@@ -210,6 +273,14 @@ def fit_texts(texts: Sequence[str], width: int) -> str:
             break
         line = longer
     return line
+
+
+def whole_text(seconds: float) -> str:
+    """A rough time: 40 s, 9 min, 2.5 h."""
+    seconds = max(seconds, 0.0)
+    if seconds < 60:
+        return f"{math.ceil(seconds / 10) * 10} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def clock_text(seconds: float) -> str:

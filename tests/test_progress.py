@@ -4,7 +4,16 @@ import io
 
 import pytest
 
-from popgen.progress import Figure, NullReporter, PlainReporter, RichReporter, clock_text, fit_texts, make_reporter
+from popgen.progress import (
+    Figure,
+    NullReporter,
+    PlainReporter,
+    RichReporter,
+    clock_text,
+    fit_texts,
+    make_reporter,
+    whole_text,
+)
 
 
 class Terminal(io.StringIO):
@@ -86,6 +95,50 @@ def test_a_terminal_of_80_columns_shows_numbers_and_time(monkeypatch: pytest.Mon
     assert "0:00:00" in last and "-:--:--" in last and "44%" in last
 
 
+def test_80_columns_have_room_for_steps_and_the_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    terminal = Terminal()
+    reporter = RichReporter(terminal)
+    reporter.phase("member 2 of 8: imagination", 100)
+    reporter.expect(540.0)
+    reporter.update(44, steps=123_456, entropy=1.2)
+    reporter.phase("member 3 of 8: imagination", 100)
+    reporter.close()
+    ended, running = [line for line in terminal.getvalue().splitlines() if "imagination" in line][-2:]
+    assert "steps 123,456" in ended and "44%" in ended and "-:--:--" in running and "…" not in ended + running
+    assert "all 9 min" in running and "all" not in ended, "the last line tells of the whole"
+
+
+def test_plain_lines_tell_of_the_whole_run_as_far_as_it_is_known() -> None:
+    clock, stream = Clock(), io.StringIO()
+    reporter = PlainReporter(stream, clock=clock)
+    reporter.phase("member 1 of 2: self-play", 10)
+    reporter.update(1, steps=5)
+    reporter.expect(400.0)
+    clock.now = 40.0
+    reporter.update(2)
+    assert stream.getvalue().splitlines() == [
+        "member 1 of 2: self-play  10%  steps 5  0s passed",
+        "member 1 of 2: self-play  20%  steps 5  40s passed  about 5:20 left  about 6 min in all",
+    ]
+
+
+def test_a_silent_phase_gets_a_line_every_few_seconds() -> None:
+    clock, stream = Clock(), io.StringIO()
+    reporter = PlainReporter(stream, every=5.0, clock=clock)
+    reporter.tell_if_silent()
+    reporter.phase("starting Ray", 0)
+    for now in (4.0, 5.0, 9.0, 10.0):
+        clock.now = now
+        reporter.tell_if_silent()
+    assert stream.getvalue().splitlines() == ["starting Ray  5s passed", "starting Ray  10s passed"]
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(-3, "0 s"), (31, "40 s"), (540, "9 min"), (9000, "2.5 h")])
+def test_whole_text(seconds: float, text: str) -> None:
+    assert whole_text(seconds) == text
+
+
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0s"), (59.4, "59s"), (125, "2:05"), (3725, "1:02:05")])
 def test_clock_text(seconds: float, text: str) -> None:
     assert clock_text(seconds) == text
@@ -111,6 +164,7 @@ def test_the_stream_decides_the_form() -> None:
 def test_null_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     reporter = NullReporter()
     reporter.phase("x", 1)
+    reporter.expect(3.0)
     reporter.update(1, a=1)
     reporter.note("y")
     reporter.close()

@@ -88,9 +88,10 @@ def execute(config: RunConfig, args: argparse.Namespace) -> int:
     if args.own_process:
         keep_native_lines(native_lines(run_folder(config)))
     before_ray(config.cluster.threads, config.cluster.address is None)
-    from popgen.pipelines.population import run_population
-
     with closing(make_reporter(quiet=args.quiet)) as reporter:
+        reporter.phase("loading libraries", 0)
+        from popgen.pipelines.population import run_population
+
         result = run_population(config, reporter=reporter)
     if args.json:
         print_json(result)

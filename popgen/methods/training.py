@@ -20,6 +20,7 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+from popgen.envs.contract import EnvSpec
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.policy import Policy
@@ -120,10 +121,38 @@ class StepCount:
 
 @dataclass(frozen=True)
 class Phase:
-    """Something new begins; `total` is its amount of work in any unit, which `Progress.done` counts."""
+    """Something new begins.
+
+    Attributes:
+        name: the same for all members: "self-play".
+        total: its amount of work in any unit, which `Progress.done` counts.
+        member: whom it trains.
+        last: the last of those it trains together; 0 where that is `member`.
+        done: of the total, before it begins: a phase may go on where an earlier attempt was.
+    """
 
     name: str
     total: float
+    member: int
+    last: int = 0
+    done: float = 0.0
+
+
+@dataclass(frozen=True)
+class PlannedPhase:
+    """A phase that a run is expected to have, for the estimate of the time left.
+
+    Attributes:
+        name, member, last: as those of `Phase`.
+        cost: seconds that its total takes on two laptop cores, roughly: what counts is the ratio of phases.
+        earliest: share of the total at which it may be over, where a target can end it.
+    """
+
+    name: str
+    member: int
+    cost: float
+    last: int = 0
+    earliest: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -228,17 +257,23 @@ class Training(Protocol):
         learners: first parts of figures' names (`model/loss`) that must be finite: a learner does not recover.
         log_rows: rows in the log from which on a whole copy of the buffers is written; 1 where there is no log.
         begins_workers: `begin` starts workers: the cluster must have room for them then.
+        spec: of the environment.
     """
 
     learners: tuple[str, ...]
     log_rows: int
     begins_workers: bool
+    spec: EnvSpec
 
     def adopt(self, weights: dict[int, Weights], left: State) -> None:
         """Take over finished members: their acting weights, and what the last of them left behind ({} if nothing)."""
 
     def first_of_group(self, member: int) -> int:
         """The first of the members that learn together with `member`: itself where they learn one after the other."""
+        ...
+
+    def plan(self) -> list[PlannedPhase]:
+        """The phases of all of the run's members, in order."""
         ...
 
     def begin(self, first: int) -> tuple[int, ...]:

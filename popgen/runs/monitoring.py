@@ -102,6 +102,10 @@ class LoggingReporter:
         self.log.write("note", text=name)
         self.inner.phase(name, total)
 
+    def expect(self, seconds: float | None) -> None:
+        """See `Reporter.expect`."""
+        self.inner.expect(seconds)
+
     def update(self, done: float, **figures: Figure) -> None:
         """See `Reporter.update`."""
         self.inner.update(done, **figures)

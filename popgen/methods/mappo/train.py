@@ -24,7 +24,17 @@ from popgen.methods.mappo.algorithm import Mappo, build_algorithm
 from popgen.methods.mappo.config import BaselineRun, DiversityConfig, PartnerRun
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.training_job import Job, policy_config
-from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
+from popgen.methods.training import (
+    Checkpoint,
+    Loop,
+    Phase,
+    PlannedPhase,
+    Progress,
+    Round,
+    State,
+    StepCount,
+    TrainedMember,
+)
 from popgen.methods.transport import InlineTransport, Transport
 from popgen.nets.weights import Weights, prefixed
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
@@ -96,6 +106,9 @@ def check_card(cluster: ClusterConfig) -> None:
         raise UserError("cluster.agent_gpus", problem, "set it to 0, or start the driver where there is one")
 
 
+STEP_SECONDS = 1.2e-4  # of an environment step and what is learned from it, on a laptop's core
+
+
 class RllibTraining:
     """The training of one run's members in one attempt (`popgen.methods.training.Training`)."""
 
@@ -126,7 +139,7 @@ class RllibTraining:
         """Iterations, to the end of all members that learn together."""
         first, last, algorithm = self.learning[0], self.learning[-1], self.algorithm
         names = f"member {first}" + (f" to {last}" if last > first else "")
-        yield Phase(f"{names}: {self.config.method}", 1.0)
+        yield Phase(self.config.method, 1.0, first, last, done=min(1.0, algorithm.progress))
         if algorithm.rounds:
             steps = self.progress.steps[first]
             yield Progress(first, steps, note=f"continuing after {algorithm.rounds} iterations of {names}")
@@ -211,6 +224,18 @@ class RllibTraining:
     def first_of_group(self, member: int) -> int:
         """See `Training`."""
         return learning_members(self.objective, self.config, member)[0]
+
+    def plan(self) -> list[PlannedPhase]:
+        """See `Training`."""
+        diversity, steps = partner_settings(self.objective, self.config), self.config.ppo.max_steps
+        met = diversity.xp_envs / self.config.ppo.envs if diversity is not None else 0.0
+        phases, first = list[PlannedPhase](), 1
+        while first <= self.config.population.size:
+            last = learning_members(self.objective, self.config, first)[-1]
+            cost = (last - first + 1) * (1.0 + met * (last - 1)) * steps * STEP_SECONDS
+            phases.append(PlannedPhase(self.config.method, first, cost, last, earliest=0.0))
+            first = last + 1
+        return phases
 
     def begin(self, first: int) -> tuple[int, ...]:
         """Start RLlib's learner and runners.

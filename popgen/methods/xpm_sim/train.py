@@ -23,6 +23,7 @@ from popgen.methods.training import (
     Loop,
     Pending,
     Phase,
+    PlannedPhase,
     PolicySnapshot,
     Progress,
     Round,
@@ -41,6 +42,9 @@ from popgen.play.partner_constraint import PartnerConstraint
 from popgen.play.partner_strength import PartnerStrength
 from popgen.types import Kind
 
+SIMULATED_PLAY = "simulated play"
+STEP_SECONDS = 5e-5  # of a simulated step and what is learned from it, on a laptop's core
+
 
 class XpmSimTraining:
     """The training of one run's members in one attempt (`popgen.methods.training.Training`)."""
@@ -51,6 +55,7 @@ class XpmSimTraining:
 
     def __init__(self, config: XpmSimRun, spec: EnvSpec, attempt: str, workers: Workers) -> None:
         self.run, self.config, self.spec, self.workers = config.run, config.xpm_sim, spec, workers
+        self.run_size = config.population.size
         self.attempt = attempt.rpartition(".")[2]
         self.policy = make_actor(self.config, spec)
         self.archive: dict[int, Pending[Weights]] = {}
@@ -65,7 +70,7 @@ class XpmSimTraining:
     def train(self) -> Loop:
         """Real episodes and updates in turn, to the end of the member."""
         config, now, began = self.config, self.progress, time.time()
-        yield Phase(f"member {self.member}: simulated self-play and cross-play", config.updates)
+        yield Phase(SIMULATED_PLAY, config.updates, self.member, done=now.updates)
         if now.rounds:
             yield Progress(
                 self.member, now.steps, note=f"continuing after {now.updates} updates of member {self.member}"
@@ -168,6 +173,14 @@ class XpmSimTraining:
     def first_of_group(self, member: int) -> int:
         """Members learn one after the other."""
         return member
+
+    def plan(self) -> list[PlannedPhase]:
+        """See `Training`. Whoever has predecessors simulates cross-play too."""
+        now = self.config
+        alone = now.sims_sp * now.unroll
+        cross = now.sims_restart * now.restart_horizon + now.sims_xp * now.xp_horizon
+        costs = {member: alone + cross * (member > 1) for member in range(1, self.run_size + 1)}
+        return [PlannedPhase(SIMULATED_PLAY, m, now.updates * cost * STEP_SECONDS) for m, cost in costs.items()]
 
     def begin(self, first: int) -> tuple[int, ...]:
         """See `Training`."""

@@ -245,6 +245,21 @@ def rare_events(tally: Tally | None, config: DiscoveryConfig) -> tuple[int, ...]
     return () if tally is None else tuple(np.flatnonzero(tally.events < config.rare_events).tolist())
 
 
+# ---- phases of the loop ----------------------------------------------------------------------------------------------
+
+RANDOM_PLAY, MODEL_ALONE, SELF_PLAY, IMAGINATION = "random play", "world model", "self-play", "imagination"
+
+
+def self_play_steps(phase: Phase1Config) -> int:
+    """Environment steps of self-play at most."""
+    return max(1, phase.max_steps - phase.prefill_steps)
+
+
+def count_imagination(phase: Phase2Config, rounds: int) -> int:
+    """Agent updates of so many rounds."""
+    return phase.first_updates + (rounds - 1) * phase.updates_per_round if rounds else 0
+
+
 # ---- rules of phase 1 ------------------------------------------------------------------------------------------------
 
 

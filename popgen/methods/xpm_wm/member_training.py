@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 
 from popgen.envs.contract import EnvSpec
-from popgen.methods.training import Checkpoint, Loop, Pending, Progress, State, TrainedMember
+from popgen.methods.training import Checkpoint, Loop, Pending, PlannedPhase, Progress, State, TrainedMember
+from popgen.methods.xpm_wm import member_progress as rules
 from popgen.methods.xpm_wm.acting import WorldModelPolicy
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
@@ -13,6 +14,31 @@ from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMembe
 from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
 from popgen.play.partner_strength import PartnerStrength
+
+ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS = 8e-5, 5e-5, 5e-6
+"""On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step."""
+
+
+def plan_phases(config: XpmWmRun, spec: EnvSpec) -> list[PlannedPhase]:
+    """What all members will go through; costs are those of the updates, at the laptop's sizes."""
+    one, two, agent = config.phase1, config.phase2, config.agent
+    model_update = config.world_model.batch * config.world_model.length * ROW_SECONDS
+    alone = agent.starts_sp * agent.horizon * IMAGINED_SECONDS
+    together = (agent.starts_sp + agent.starts_xp) * agent.horizon * IMAGINED_SECONDS
+    rounds = rules.self_play_steps(one) / (one.envs * one.steps_per_iteration)
+    each = one.model_updates * model_update + one.agent_updates * alone
+    phases = [
+        PlannedPhase(rules.RANDOM_PLAY, FIRST, one.prefill_steps * STEP_SECONDS),
+        PlannedPhase(rules.MODEL_ALONE, FIRST, one.pretrain_updates * model_update),
+        PlannedPhase(rules.SELF_PLAY, FIRST, rounds * each, earliest=0.0),
+    ]
+    for member in range(FIRST + 1, config.population.size + 1):
+        most = rules.most_rounds(two, max(two.episodes_xp, 2 * (member - 1)), spec.horizon)
+        updates = rules.count_imagination(two, most)
+        cost = updates * together + (most - 1) * two.model_updates * model_update
+        earliest = rules.count_imagination(two, min(two.rounds, most)) / updates
+        phases.append(PlannedPhase(rules.IMAGINATION, member, cost, earliest=earliest))
+    return phases
 
 
 class XpmWmTraining:
@@ -47,6 +73,10 @@ class XpmWmTraining:
     def first_of_group(self, member: int) -> int:
         """Members learn one after the other."""
         return member
+
+    def plan(self) -> list[PlannedPhase]:
+        """See `Training`."""
+        return plan_phases(self.config, self.spec)
 
     def begin(self, first: int) -> tuple[int, ...]:
         """A fresh agent on the world model so far."""

@@ -49,7 +49,7 @@ class FirstMember:
         if not resumed:
             yield from self.collect_random_episodes()
             yield from self.pretrain()
-        yield Phase("member 1: self-play", self.phase.max_steps)
+        yield Phase(rules.SELF_PLAY, rules.self_play_steps(self.phase), FIRST, done=self.count_self_play())
         if not resumed:
             self.start_self_play()
             yield Round(FIRST, self.progress.steps, number=0, must_save=True)
@@ -60,10 +60,14 @@ class FirstMember:
                 return rules.choose_first(self.progress)
             self.start_self_play()
 
+    def count_self_play(self) -> int:
+        """Environment steps after random play."""
+        return max(0, self.progress.steps - self.phase.prefill_steps)
+
     def collect_random_episodes(self) -> Records:
         """Lines 2 and 3: B_SP is populated with K random episodes."""
         phase, progress = self.phase, self.progress
-        yield Phase("member 1: random play", phase.prefill_steps)
+        yield Phase(rules.RANDOM_PLAY, phase.prefill_steps, FIRST)
         snapshot = real.random_snapshot(self.spec, phase.prefill_interact, self.work.put)
         self.work.start_episodes([real.random_match(phase.envs)], {RANDOM_MEMBER: snapshot}, self.seed)
         while progress.steps < phase.prefill_steps:
@@ -75,7 +79,7 @@ class FirstMember:
     def pretrain(self) -> Records:
         """World-model updates alone, in pieces for the progress bar; then the agent's first ones."""
         total = self.phase.pretrain_updates
-        yield Phase("member 1: world model on random play", total)
+        yield Phase(rules.MODEL_ALONE, total, FIRST)
         for done in range(0, total, MODEL_PIECE):
             count = min(MODEL_PIECE, total - done)
             update = self.update_world_model(count).result()
@@ -173,7 +177,7 @@ class FirstMember:
         trouble = progress.watch.look(figures, report, watch, watch.first_rounds)
         note = self.restart_if_due() or (trouble and f"member 1: {trouble}")
         ended = Round(FIRST, steps, figures, sampled, number=progress.rounds, at_rest=not overlap.running)
-        return replace(ended, done=steps, shown=shown, note=note, work=dict(overlap.work))
+        return replace(ended, done=self.count_self_play(), shown=shown, note=note, work=dict(overlap.work))
 
     def restart_if_due(self) -> str:
         """Line 1 again on the world model learned so far; a note about it."""
@@ -217,8 +221,8 @@ class LaterMember:
     def train(self) -> Loop:
         """All rounds; line 1 is done."""
         phase, progress = self.phase, self.progress
-        total = phase.first_updates + (self.most_rounds - 1) * phase.updates_per_round
-        yield Phase(f"member {self.member}: imagined self-play and cross-play", total)
+        total, done = (rules.count_imagination(phase, rounds) for rounds in (self.most_rounds, progress.rounds))
+        yield Phase(rules.IMAGINATION, total, self.member, done=done)
         while rules.plays_on(progress, phase, self.most_rounds):  # 4
             if progress.rounds:
                 update = self.work.update_world_model(ModelTask(phase.model_updates)).result()  # 5-7
