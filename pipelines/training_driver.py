@@ -58,7 +58,7 @@ class TrainingDriver:
         self.training, self.checkpoints = training, checkpoints
         self.running: tuple[int, ...] = ()
         size = config.population.size
-        steps = size**2 * config.evaluation.episodes * training.spec.horizon
+        steps = size**2 * config.evaluation.episodes * recorder.spec.horizon
         self.estimate = RunEstimate(
             [*training.plan(), PlannedPhase(EVALUATION, size, EVALUATION_SECONDS + steps * EVALUATED_SECONDS)]
         )

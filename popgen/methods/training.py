@@ -20,7 +20,6 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from popgen.envs.contract import EnvSpec
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.policy import Policy
@@ -257,13 +256,11 @@ class Training(Protocol):
         learners: first parts of figures' names (`model/loss`) that must be finite: a learner does not recover.
         log_rows: rows in the log from which on a whole copy of the buffers is written; 1 where there is no log.
         begins_workers: `begin` starts workers: the cluster must have room for them then.
-        spec: of the environment.
     """
 
     learners: tuple[str, ...]
     log_rows: int
     begins_workers: bool
-    spec: EnvSpec
 
     def adopt(self, weights: dict[int, Weights], left: State) -> None:
         """Take over finished members: their acting weights, and what the last of them left behind ({} if nothing)."""

@@ -98,8 +98,9 @@ class EgoNet(nn.Module):
         """Orthogonal layers of gain sqrt(2), nearly uniform first actions and choices, zs that differ from each
         other from the start."""
         for layer in (*self.convolutions, self.first, self.second, self.hidden):
-            nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
-            nn.init.zeros_(layer.bias)
+            weight, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
+            nn.init.orthogonal_(weight, math.sqrt(2.0))
+            nn.init.zeros_(bias)
         for head in [self.action] + ([] if self.skill is None else [self.skill]):
             nn.init.orthogonal_(head.weight, 0.01)
             nn.init.zeros_(head.bias)

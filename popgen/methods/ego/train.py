@@ -21,7 +21,17 @@ from popgen.methods.ego.ego_policy import EgoPolicy
 from popgen.methods.ego.ego_rollout import EndedEpisode
 from popgen.methods.ego.partner_source import PartnerSource, name_partners
 from popgen.methods.ego.workers import Iterations, Workers
-from popgen.methods.training import Checkpoint, Loop, Phase, Progress, Round, State, StepCount, TrainedMember
+from popgen.methods.training import (
+    Checkpoint,
+    Loop,
+    Phase,
+    PlannedPhase,
+    Progress,
+    Round,
+    State,
+    StepCount,
+    TrainedMember,
+)
 from popgen.nets.weights import Weights, prefixed
 from popgen.types import Kind
 
@@ -61,6 +71,9 @@ class EgoProgress:
             self.scores[name] = before + FORGETS * (episode.score - before)
 
 
+STEP_SECONDS = 1e-4  # of an environment step and what is learned from it, on a laptop's core
+
+
 class EgoTraining:
     """The training of one run's egos in one attempt (`popgen.methods.training.Training`)."""
 
@@ -82,12 +95,12 @@ class EgoTraining:
         self.names = name_partners(self.sources)
         self.kind = Kind.SP if config.plays_itself else Kind.XP
         self.member, self.seed, self.progress = 0, 0, EgoProgress()
+        self.size = config.population.size
 
     def train(self) -> Loop:
         """Iterations until the steps are done."""
         config, now = self.config, self.progress
-        beside = f"{len(self.names)} partner{'s' * (len(self.names) > 1)}" if self.names else "itself"
-        yield Phase(f"ego {self.member} beside {beside}", config.steps)
+        yield Phase(self._name_phase(), config.steps, self.member, done=now.steps)
         if now.rounds:
             yield Progress(self.member, now.steps, note=f"continuing after {now.steps:,} steps of ego {self.member}")
         size = config.envs * config.unroll
@@ -145,6 +158,15 @@ class EgoTraining:
     def first_of_group(self, member: int) -> int:
         """Egos learn one after the other."""
         return member
+
+    def _name_phase(self) -> str:
+        beside = f"{len(self.names)} partner{'s' * (len(self.names) > 1)}" if self.names else "itself"
+        return f"play beside {beside}"
+
+    def plan(self) -> list[PlannedPhase]:
+        """See `Training`."""
+        name, cost = self._name_phase(), self.config.steps * STEP_SECONDS
+        return [PlannedPhase(name, member, cost) for member in range(1, self.size + 1)]
 
     def begin(self, first: int) -> tuple[int, ...]:
         """See `Training`."""
