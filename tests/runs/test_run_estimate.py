@@ -10,6 +10,11 @@ import pytest
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
+from popgen.methods.mappo.comedi import OBJECTIVE as COMEDI
+from popgen.methods.mappo.config import BaselineRun
+from popgen.methods.mappo.lipo import OBJECTIVE as LIPO
+from popgen.methods.mappo.objective import SELF_PLAY, Objective
+from popgen.methods.mappo.train import RllibTraining
 from popgen.methods.training import Phase, PlannedPhase
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import plan_phases
@@ -114,3 +119,22 @@ def test_nothing_is_promised_before_something_was_measured() -> None:
     assert estimate.seconds_left() is None
     estimate.begin(Phase("a phase that no plan has", 100, 1))
     assert estimate.seconds_left() is None
+
+
+@pytest.mark.parametrize(
+    ("method", "objective", "groups"),
+    [
+        ("mappo", SELF_PLAY, [(1, 1), (2, 2), (3, 3)]),
+        ("comedi", COMEDI, [(1, 1), (2, 2), (3, 3)]),
+        ("lipo", LIPO, [(1, 3)]),
+    ],
+)
+def test_baselines_plan_a_phase_for_each_group_of_members(
+    method: str, objective: Objective, groups: list[tuple[int, int]]
+) -> None:
+    config = RunConfig.parse(compose(["env=overcooked/cramped_room", f"method={method}", "population.size=3"]))
+    assert isinstance(config, BaselineRun)
+    plan = RllibTraining(config, make_env(config.env.name, 1).spec, "run.1", objective).plan()
+    assert [(phase.member, phase.last) for phase in plan] == groups
+    costs = [phase.cost for phase in plan]
+    assert min(costs) > 0.0 and costs == sorted(costs), "whoever meets more partners takes longer"
