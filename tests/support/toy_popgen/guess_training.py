@@ -12,6 +12,7 @@ from popgen.methods.training import (
     Checkpoint,
     Loop,
     Phase,
+    PlannedPhase,
     PolicySnapshot,
     Round,
     Sampled,
@@ -32,7 +33,7 @@ class GuessTraining:
     begins_workers = False
 
     def __init__(self, config: GuessRun, spec: EnvSpec, transport: Transport, samplers: SamplerPool) -> None:
-        self.config, self.seed, self.spec = config.guess, config.run.seed, spec
+        self.config, self.seed, self.spec, self.size = config.guess, config.run.seed, spec, config.population.size
         self.transport, self.samplers = transport, samplers
         self.archive: dict[int, Weights] = {}
         self._start_fresh(0)
@@ -49,6 +50,10 @@ class GuessTraining:
         """Members are found one after the other."""
         return member
 
+    def plan(self) -> list[PlannedPhase]:
+        """See `Training`: one phase a member, all alike."""
+        return [PlannedPhase("guessing", member, 1.0) for member in range(1, self.size + 1)]
+
     def begin(self, first: int) -> tuple[int, ...]:
         """Forget the member before."""
         self._start_fresh(first)
@@ -56,7 +61,7 @@ class GuessTraining:
 
     def train(self) -> Loop:
         """Rounds, then the member."""
-        yield Phase(f"member {self.member}: guessing", self.config.rounds)
+        yield Phase("guessing", self.config.rounds, self.member)
         while self.rounds < self.config.rounds:
             yield self.try_habit()
         policy = HabitPolicy(self.spec.num_actions, self.best.tolist())
