@@ -85,3 +85,17 @@ def test_an_optimiser_goes_on_where_it_was() -> None:
     assert all(
         np.array_equal(a, b) for a, b in zip(w.weights_of(first).values(), w.weights_of(second).values(), strict=True)
     )
+
+
+def test_a_fused_optimiser_steps_like_the_plain_one_and_goes_on_from_its_state() -> None:
+    """Of 60 steps, 30 from the plain one's moments; the order of additions differs."""
+    plain, fused = (torch.nn.Parameter(torch.linspace(-1.0, 1.0, 50)) for _ in range(2))
+    one, other = torch.optim.Adam([plain], lr=0.01), torch.optim.Adam([fused], lr=0.01, fused=True)
+    for step in range(60):
+        if step == 30:
+            w.load_optimiser_state(other, w.optimiser_state(one))
+        for parameter, optimiser in ((plain, one), (fused, other)):
+            optimiser.zero_grad()
+            (parameter - 0.3).pow(2).sum().backward()
+            optimiser.step()
+    assert torch.allclose(plain, fused, atol=1e-5)

@@ -60,7 +60,7 @@ class AgentNetworks:
         return Critic(self.config, self.model_config).to(self.device)
 
     def _make_optimiser(self, module: nn.Module, rate: float) -> torch.optim.Adam:
-        return torch.optim.Adam(module.parameters(), lr=rate, eps=self.config.adam_eps)
+        return torch.optim.Adam(module.parameters(), lr=rate, eps=self.config.adam_eps, fused=True)
 
     def add_critic(self, partner: int) -> None:
         """A critic of cross-play with one more partner; the optimisers begin anew."""

@@ -43,6 +43,7 @@ LAPTOP = Recipe(
             "phase1.agent_updates": 7,
             "phase1.event_starts": "always",
             "phase1.max_steps": 3_200_000,
+            "phase1.plateau": because(15, "the target is not reached: rounds of 12,800 steps without a gain end it"),
             "discovery.count_bonus": because(1.0, "carries soups across the border between the players' roles"),
             "discovery.trust": because(2.0, _FALSE_DELIVERIES),
             "discovery.rare_events": 300,

@@ -70,7 +70,7 @@ class ModelLearner:
         torch.manual_seed(seed)
         self.config, self.spec, self.device = config, spec, torch.device(device)
         self.model = WorldModel(config, spec).to(self.device)
-        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=config.learning_rate, eps=1e-8)
+        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=config.learning_rate, eps=1e-8, fused=True)
         self.generator = torch.Generator(self.device).manual_seed(seed + 1)
         self.rng = np.random.default_rng(seed + 2)
         self.predecessors: dict[int, LatentFilter] = {}
