@@ -118,7 +118,8 @@ def test_a_finished_episode_must_be_reset():
     with pytest.raises(RuntimeError, match="reset"):
         env.step(dict.fromkeys(AGENTS, 0))
     env.reset()
-    assert env.step(dict.fromkeys(AGENTS, 0))[3] == dict.fromkeys(AGENTS, True)
+    _, _, terminated, truncated, _ = env.step(dict.fromkeys(AGENTS, 0))
+    assert terminated == dict.fromkeys(AGENTS, True) and truncated == dict.fromkeys(AGENTS, False)
     with pytest.raises(RuntimeError, match="reset"):
         env.step(dict.fromkeys(AGENTS, 0))
 
