@@ -210,7 +210,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     files = write_report(result, recorder.dir / "report")
     size = len(recorder.population)
     episodes = result.count_episodes()
-    recorder.record_evaluation(size, result.steps, episodes)
+    recorder.record_evaluation(result.steps, episodes)
     title = f"{spec.name}, {title_of(config.method)}, seed {config.run.seed}"
     files |= write_run_figures(
         recorder.dir, recorder.dir / "report", recorder.member_steps(), unit=spec.score_name, title=title

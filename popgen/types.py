@@ -19,8 +19,15 @@ class Kind(StrEnum):
     SIMULATED = "simulated"  # steps of an exact simulator used as the dynamics model F
 
 
+TRAINING_KINDS = (Kind.RANDOM, Kind.SP, Kind.XP, Kind.MP)
+"""Real steps that training took. A total of steps, wherever one is given, is of these: neither evaluation nor a
+simulator's steps."""
+
 RANDOM_MEMBER = 0
 """Member id of the uniform-random player; trained members count from 1."""
+
+POPULATION = 0
+"""Who stands for all members in the ledger: the final evaluation is nobody's own."""
 
 
 @dataclass(frozen=True)

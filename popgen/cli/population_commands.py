@@ -29,7 +29,8 @@ def add(commands: Any) -> None:
         "the runs in a folder: state, member, environment steps, last error",
         "States: running, finished, failed, interrupted (`popgen run` with the same run.id goes on), damaged. Keys of "
         "--json: root, and runs, each with id, state, method, scale, environment, member (that is trained) of size, "
-        "steps (by kind), total_steps, seconds (of all attempts), attempt, began (seconds since 1970), error.",
+        "steps (by kind), total_steps (of training), seconds (of all attempts), attempt, began (seconds since "
+        "1970), error.",
     )
     parser.add_argument("root", metavar="ROOT", nargs="?", default="runs", help="folder of the runs (%(default)s)")
 

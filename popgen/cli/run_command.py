@@ -131,6 +131,9 @@ def _print_config(values: dict[str, Any], as_json: bool) -> int:
     return OK
 
 
+WHOSE = {"total": "all", "population": "of the population"}
+
+
 def _print_run(result: Mapping[str, Any]) -> None:
     """The last screen: the matrix, what it means, what it took, and how to go on; 80 columns."""
     from popgen.reports.crossplay_report import matrix_sheet, summary
@@ -147,7 +150,7 @@ def _print_run(result: Mapping[str, Any]) -> None:
     print()
     for who, row in result["ledger"].items():
         kinds = ", ".join(f"{kind} {steps:,}" for kind, steps in row.items() if steps and kind != "total")
-        print(f"environment steps, {'all' if who == 'total' else f'member {who}'}: {kinds}")
+        print(f"environment steps, {WHOSE.get(who, f'member {who}')}: {kinds}")
     print(f"time: {result['seconds'] / 60:.1f} minutes")
     files = result.get("files", {})
     if "report" in files:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 import popgen
 from popgen.envs.contract import EnvSpec
 from popgen.jsonable import jsonable
-from popgen.types import Kind
+from popgen.types import TRAINING_KINDS, Kind
 
 FORMAT = "popgen-population"
 FORMAT_VERSION = 1
@@ -154,8 +154,8 @@ class MemberInfo(Record):
 
     @property
     def total_steps(self) -> int:
-        """Environment steps of all kinds."""
-        return sum(self.steps.values())
+        """Environment steps that training took."""
+        return sum(self.steps.get(str(kind), 0) for kind in TRAINING_KINDS)
 
 
 def folder_name(member: int) -> str:

@@ -27,6 +27,7 @@ from popgen.config.run_config import RunConfig
 from popgen.durable_files import read_regular, replace_file
 from popgen.errors import UserError, mask_credentials
 from popgen.runs.interruption import describe_interruption
+from popgen.types import TRAINING_KINDS
 
 LOCK, STATE = "run.lock", "state.json"
 STATES = ("running", "finished", "failed", "interrupted", "damaged")
@@ -163,8 +164,9 @@ def describe_run(folder: Path) -> dict[str, Any]:
     """What a run's folder tells of it; nothing in it is changed.
 
     Keys: id; state (running, finished, failed, interrupted, damaged); method, scale, environment; member (the one
-    that is trained, or the last one) of size; steps (environment steps by ledger kind) and total_steps; seconds of all
-    attempts; attempt; began (of the last attempt, seconds since 1970); error (of the last attempt, None without one).
+    that is trained, or the last one) of size; steps (environment steps by ledger kind) and total_steps (of training);
+    seconds of all attempts; attempt; began (of the last attempt, seconds since 1970); error (of the last attempt, None
+    without one).
     A folder with a file that cannot be read is "damaged", and `error` names it.
     """
     known: dict[str, Any] = {"id": _strip_controls(folder.name), "state": "damaged", "method": None, "scale": None}
@@ -190,7 +192,7 @@ def describe_run(folder: Path) -> dict[str, Any]:
     done = members >= known["size"] and (folder / "report" / "crossplay.json").exists()
     told = state.get("error")
     known |= {"state": _present_state(folder, state, done), "error": None if told is None else _strip_controls(told)}
-    return known | {"total_steps": sum(known["steps"].values())}
+    return known | {"total_steps": sum(known["steps"].get(str(kind), 0) for kind in TRAINING_KINDS)}
 
 
 def describe_end(error: BaseException) -> str:

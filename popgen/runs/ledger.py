@@ -13,7 +13,7 @@ from typing import Any
 
 from popgen.durable_files import replace_file
 from popgen.errors import UserError
-from popgen.types import Kind, LedgerEntry
+from popgen.types import POPULATION, TRAINING_KINDS, Kind, LedgerEntry
 
 
 class LedgerConflict(RuntimeError):
@@ -125,16 +125,19 @@ class Ledger:
         return int(sum(total[1] for total in self._select_totals(member, kind)))
 
     def table(self) -> dict[str, dict[str, int]]:
-        """Environment steps: member -> kind -> steps, with a `total` in each row and a row `total`; JSON-able."""
+        """Environment steps: member -> kind -> steps, a row `population` for what is no member's own, a row `total`.
+
+        JSON-able. The `total` in each row is of the steps that training took, `TRAINING_KINDS`.
+        """
         rows: dict[str, dict[str, int]] = {}
         total: dict[str, int] = {}
         for (member, kind), (steps, _, _) in sorted(self._totals.items()):
-            row = rows.setdefault(str(member), {})
+            row = rows.setdefault("population" if member == POPULATION else str(member), {})
             row[str(kind)] = int(steps)
             total[str(kind)] = total.get(str(kind), 0) + int(steps)
         rows["total"] = total
         for row in rows.values():
-            row["total"] = sum(row.values())
+            row["total"] = sum(row.get(str(kind), 0) for kind in TRAINING_KINDS)
         return rows
 
     def to_csv(self, path: str | Path) -> None:

@@ -32,9 +32,7 @@ from popgen.runs.sinks.run_log_sink import RunLogSink
 from popgen.runs.sinks.sink import CheckpointWritten, MemberAdded, MetricPoint, Sink
 from popgen.runs.sinks.storage_sink import StorageSink
 from popgen.runs.storage import Mirror
-from popgen.types import Kind, LedgerEntry
-
-TRAINING_KINDS = (Kind.RANDOM, Kind.SP, Kind.XP, Kind.MP)
+from popgen.types import POPULATION, TRAINING_KINDS, Kind, LedgerEntry
 
 
 class RunRecorder:
@@ -117,14 +115,14 @@ class RunRecorder:
         """Enter steps that no sampler actor took."""
         self.record_step_count(StepCount(member, kind, name, sequence, steps, episodes))
 
-    def record_evaluation(self, member: int, steps: int, episodes: int) -> None:
+    def record_evaluation(self, steps: int, episodes: int) -> None:
         """Enter the final evaluation, a run's last steps. Done again, it counts once: other figures replace the old."""
         name = "evaluation"
         entries = enumerate(self.ledger)
         before = next((i for i, e in entries if e.kind is Kind.EVALUATION and e.sampler == name), None)
         if before is not None:
             self.ledger.cut(before)
-        self.record_steps(member, Kind.EVALUATION, name, 0, steps, episodes)
+        self.record_steps(POPULATION, Kind.EVALUATION, name, 0, steps, episodes)
 
     def _record_entries(self, entries: Sequence[LedgerEntry]) -> None:
         for sink in self.sinks:

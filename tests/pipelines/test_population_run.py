@@ -169,7 +169,7 @@ def check_ledger(run: Run) -> None:
     counted = {
         (int(member), kind): steps
         for member, row in table.items()
-        if member != "total"
+        if member not in ("total", "population")
         for kind, steps in row.items()
         if kind not in ("total", "evaluation")
     }
@@ -196,8 +196,9 @@ def test_every_step_is_in_the_ledger_and_in_the_buffers(whole: Run) -> None:
     assert table["1"]["SP"] + table["1"]["random"] >= config.phase1.max_steps
     assert table["2"]["SP"] == config.phase2.rounds * config.phase2.episodes_sp * HORIZON
     assert table["2"]["XP"] == config.phase2.rounds * config.phase2.episodes_xp * HORIZON
-    assert table["2"]["evaluation"] == whole.result["evaluation"]["steps"]["evaluation"] > 0
-    assert table["total"]["total"] == sum(steps for *_, steps, _, _ in whole.ledger())
+    assert table["population"]["evaluation"] == whole.result["evaluation"]["steps"]["evaluation"] > 0
+    assert table["population"]["total"] == 0 and "evaluation" not in table["2"]
+    assert table["total"]["total"] == sum(info.total_steps for info in whole.population.members)
 
 
 def test_the_population_holds_both_members_and_their_steps(whole: Run) -> None:
@@ -236,7 +237,8 @@ def test_the_mlflow_run_holds_what_the_run_leaves_behind(whole: Run, tmp_path: P
     assert {path.name for path in (got / "report").iterdir()} == {Path(p).name for p in whole.result["files"].values()}
     assert [info.policy_sha256 for info in load_population(got / "population").members] == sha256s(whole)
     rows = (got / "ledger.csv").read_text().splitlines()[1:]
-    assert sum(int(row.split(",")[2]) for row in rows) == whole.result["ledger"]["total"]["total"]
+    total = whole.result["ledger"]["total"]
+    assert sum(int(row.split(",")[2]) for row in rows) == total["total"] + total["evaluation"]
 
 
 def test_episodes_are_those_of_the_steps(whole: Run) -> None:

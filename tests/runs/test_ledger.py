@@ -12,7 +12,7 @@ import pytest
 
 from popgen.errors import UserError
 from popgen.runs.ledger import Ledger, LedgerConflict
-from popgen.types import Kind, LedgerEntry
+from popgen.types import POPULATION, Kind, LedgerEntry
 
 ENTRY = LedgerEntry("run", 1, Kind.SP, "sampler0", 0, 400, 1, 3.0)
 
@@ -42,6 +42,19 @@ def test_totals_by_member_and_kind(tmp_path: Path) -> None:
         "1": {"SP": 202, "XP": 204, "total": 406},
         "2": {"SP": 210, "XP": 212, "total": 422},
         "total": {"SP": 412, "XP": 416, "total": 828},
+    }
+
+
+def test_a_total_is_of_training_and_an_evaluation_of_the_population() -> None:
+    ledger = Ledger()
+    kinds = {Kind.SP: 100, Kind.XP: 20, Kind.SIMULATED: 7000}
+    for sequence, (kind, steps) in enumerate(kinds.items()):
+        ledger.record(LedgerEntry("run", 1, kind, "s", sequence, steps, 1, 0.0))
+    ledger.record(LedgerEntry("run", POPULATION, Kind.EVALUATION, "evaluation", 0, 300, 1, 0.0))
+    assert ledger.table() == {
+        "population": {"evaluation": 300, "total": 0},
+        "1": {"SP": 100, "XP": 20, "simulated": 7000, "total": 120},
+        "total": {"SP": 100, "XP": 20, "simulated": 7000, "evaluation": 300, "total": 120},
     }
 
 
