@@ -41,6 +41,7 @@ from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import RetryBudget, actor_failure, first_line, nodes_alive, user_facing_error, wait_for_room
 from popgen.runs.storage import Mirror
 from popgen.runs.tracking_address import sqlite_uri
+from popgen.types import FINAL_SKILL
 
 HALT_SECONDS = 30.0
 """Least time between two checkpoints where all overlapping work halts for one."""
@@ -243,10 +244,13 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
 
 
 def list_weak_members(config: RunConfig, recorder: RunRecorder, result: CrossPlayResult) -> list[WeakMember]:
-    """Members that do not play, by their methods' targets where there are any, and by each other."""
+    """Members that do not play, by their methods' targets where there are any, and by each other; a member that is kept
+    for its lower skill (`extra.skill`) is meant to be weak."""
     infos = load_population(recorder.dir / "population").members
     targets = {info.id: float(info.extra["target"]) for info in infos if "target" in info.extra}
-    return find_weak_members(result, targets, config.evaluation.weak_share)
+    meant = {info.id for info in infos if info.extra.get("skill", FINAL_SKILL) != FINAL_SKILL}
+    found = find_weak_members(result, targets, config.evaluation.weak_share)
+    return [one for one in found if one.member not in meant]
 
 
 def _find_mlflow(config: RunConfig, recorder: RunRecorder) -> dict[str, str] | None:

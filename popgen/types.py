@@ -26,6 +26,9 @@ simulator's steps."""
 RANDOM_MEMBER = 0
 """Member id of the uniform-random player; trained members count from 1."""
 
+FINAL_SKILL = "final"
+"""`extra.skill` of a member whose training went to its end, where others are kept from the way there."""
+
 POPULATION = 0
 """Who stands for all members in the ledger: the final evaluation is nobody's own."""
 

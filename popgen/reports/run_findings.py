@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from popgen.errors import UserError
+from popgen.methods.registry import METHODS
 from popgen.reports import paper_figures as paper
 from popgen.reports.comparison import SHARE_SP, SHARE_XP
 from popgen.reports.crossplay_report import list_warnings
@@ -53,6 +54,9 @@ def explain_scores(scores: Mapping[str, Any]) -> list[Finding]:
 def _judge_self_play(scores: Mapping[str, Any]) -> Iterator[Finding]:
     """SP beside the paper's, of the same method where it has it."""
     layout, mean = scores["environment"]["name"], scores["sp"]["mean"]
+    if scores["method"] in METHODS and METHODS[scores["method"]].trains_ego:
+        yield Finding("an ego agent: `popgen evaluate EGO --with POPULATION` tells what it is good for; SP is no aim")
+        return
     row = paper.find_row(layout, title_of(scores["method"])) or paper.find_row(layout, paper.OWN_METHOD)
     told = f"SP {number_text(mean)} {scores['unit']}"
     if mean is None:

@@ -55,6 +55,7 @@ def test_good_and_weak_populations_are_told_apart() -> None:
     ("values", "text", "good"),
     [
         ({"sp": 1.0, "xp": None}, "one member: there is no cross-play", None),
+        ({"sp": 0.0, "xp": None, "method": "hipt"}, "an ego agent: `popgen evaluate EGO --with POPULATION`", None),
         ({"sp": 0.0, "xp": 0.0}, "XP 0.00 says nothing while SP is 0.00", None),
         ({"sp": 9.0, "xp": 0.0, "episodes": 1}, "obstruction cannot be judged by one episode a pair", None),
         (

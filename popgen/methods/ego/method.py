@@ -24,6 +24,7 @@ HIPT = Method(
     needs=estimate_needs,
     check=check_run,
     policies=_POLICIES,
+    trains_ego=True,
 )
 
 FCP = Method(
@@ -39,6 +40,7 @@ FCP = Method(
     needs=estimate_needs,
     check=check_run,
     policies=_POLICIES,
+    trains_ego=True,
 )
 
 BR = Method(
@@ -54,6 +56,7 @@ BR = Method(
     needs=estimate_needs,
     check=check_run,
     policies=_POLICIES,
+    trains_ego=True,
 )
 
 SP = Method(
@@ -69,6 +72,7 @@ SP = Method(
     needs=estimate_needs,
     check=check_run,
     policies=_POLICIES,
+    trains_ego=True,
 )
 
 SP_AUG = Method(
@@ -84,4 +88,5 @@ SP_AUG = Method(
     needs=estimate_needs,
     check=check_run,
     policies=_POLICIES,
+    trains_ego=True,
 )

@@ -11,8 +11,9 @@ from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, count_numbers
 from popgen.methods.mappo.config import BaselineRun, ComediRun, FcpRun, LipoRun, PpoConfig
 from popgen.methods.method import ActorDemand, Needs, ask_for
+from popgen.types import FINAL_SKILL
 
-SKILLS = ("initial", "half", "final")
+SKILLS = ("initial", "half", FINAL_SKILL)
 """Of the members of a seed of FCP, in order."""
 
 
