@@ -353,7 +353,7 @@ def test_a_whole_run_is_evaluated(root: Path) -> None:
     result = run_population(smoke(root, "whole", *overrides), reporter=NullReporter())
     table = result["ledger"]
     assert {kind: table["2"][kind] for kind in ("SP", "XP")} == {"SP": SP_STEPS, "XP": SP_STEPS}
-    assert table["2"]["evaluation"] > 0 and np.shape(result["matrix"]["mean"]) == (2, 2)
+    assert table["population"]["evaluation"] > 0 and np.shape(result["matrix"]["mean"]) == (2, 2)
     with sqlite3.connect(root / "mlflow.db") as store:
         statuses = [status for (status,) in store.execute("select status from runs")]
         points = dict(store.execute("select key, count(*) from metrics group by key"))
