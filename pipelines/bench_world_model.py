@@ -110,7 +110,7 @@ def measure_peak(dtype: torch.dtype, seconds: float) -> float:
     best = 0.0
     for size in SIZES:
         left, right = (torch.randn(size, size).to(dtype) for _ in range(2))
-        count, took = _repeat(lambda a=left, b=right: a @ b, seconds / len(SIZES))
+        count, took = _repeat_work(lambda a=left, b=right: a @ b, seconds / len(SIZES))
         best = max(best, 2.0 * size**3 * count / took)
     return best
 
@@ -118,7 +118,7 @@ def measure_peak(dtype: torch.dtype, seconds: float) -> float:
 def measure_update(update: Callable[[], Any], seconds: float) -> Measured:
     """Time it without a profiler, then look at one update with one."""
     update()
-    count, took = _repeat(update, seconds)
+    count, took = _repeat_work(update, seconds)
     with FlopCounterMode(display=False) as counter:
         update()
     with profile(activities=[ProfilerActivity.CPU]) as profiler:
@@ -138,7 +138,7 @@ def part_of(operator: str) -> str:
     return next((part for part, begins in PARTS.items() if name.startswith(begins)), "other")
 
 
-def _repeat(work: Callable[[], Any], seconds: float) -> tuple[int, float]:
+def _repeat_work(work: Callable[[], Any], seconds: float) -> tuple[int, float]:
     """How often it was done, once at least, and the processor seconds that took: other work of the machine is not in
     them. With several threads they are those of the wall."""
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter

@@ -101,7 +101,7 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
 
     folder = None if config_dir is None else _preset_folder(config_dir)
     translated = [_translate(override) for override in overrides]
-    chosen = _choose(translated, overrides, folder)
+    chosen = _choose_groups(translated, overrides, folder)
     schema = schema_of(chosen)
     recipes = METHODS[chosen["method"]].recipes
     if (name := chosen["scale"]) not in recipes and name not in group_options("scale", folder):
@@ -148,7 +148,7 @@ def choose_method(overrides: Sequence[str], config_dir: str | None = None) -> st
         UserError: an override that cannot be read, an unknown option.
     """
     folder = None if config_dir is None else _preset_folder(config_dir)
-    return str(_choose([_translate(override) for override in overrides], overrides, folder)["method"])
+    return str(_choose_groups([_translate(override) for override in overrides], overrides, folder)["method"])
 
 
 def _list_presets(translated: Sequence[str], folder: Path | None) -> dict[str, PresetValue]:
@@ -231,7 +231,7 @@ def _preset_folder(path: str) -> Path:
     return folder
 
 
-def _choose(translated: list[str], overrides: Sequence[str], folder: Path | None) -> dict[str, Any]:
+def _choose_groups(translated: list[str], overrides: Sequence[str], folder: Path | None) -> dict[str, Any]:
     """Method, scale and environment, which the rest stands on."""
     keys = {word: word.lstrip("+").partition("=")[0] for word in translated}
     first = [word for word, key in keys.items() if key in CHOICES or key.startswith("env.")]
@@ -340,13 +340,13 @@ def _translate(override: str) -> str:
         if key in ALIASES:
             return f"{ALIASES[key]}={value}"
         if re.search(r"(^|[/'\"])~", value):  # a sign of Hydra's, but never meant so in a value
-            override = f"{key}={_quote(expand_home(value.strip(QUOTES)))}"
+            override = f"{key}={_quote_text(expand_home(value.strip(QUOTES)))}"
         is_open = key in OPEN_SECTIONS or key.startswith(tuple(f"{name}." for name in OPEN_SECTIONS))
         return f"++{override}" if is_open else override
     raise UserError("overrides", f"cannot read {short(override)!r}", "write KEY=VALUE")
 
 
-def _quote(text: str) -> str:
+def _quote_text(text: str) -> str:
     """A value that Hydra takes as it is."""
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 

@@ -149,7 +149,7 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     out = Path(args.out or "holdout")
     check_root(out, 64 * 2**20, "--out")
     with closing(make_reporter(quiet=args.quiet)) as reporter:
-        casting = _respond(casting, args, reporter)
+        casting = _train_responses(casting, args, reporter)
         reporter.phase("evaluation", 1)
         result = evaluate_holdout(
             casting,
@@ -169,7 +169,7 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     return OK
 
 
-def _respond(casting: Casting, args: argparse.Namespace, reporter: Reporter) -> Casting:
+def _train_responses(casting: Casting, args: argparse.Namespace, reporter: Reporter) -> Casting:
     """The same players with the best responses to the partners, trained first where that is asked for."""
     from popgen.pipelines.best_responses import find_responses, train_responses
 

@@ -53,7 +53,7 @@ def play(args: argparse.Namespace) -> int:
 
     population = load_population(args.population)
     if args.watch or args.html or args.gif:
-        return _watch(args, population)
+        return _watch_members(args, population)
     from popgen.pages.game_server import GameServer, serve_games
 
     server = GameServer(population, partner=args.partner, seat=args.seat, seed=args.seed)
@@ -65,7 +65,7 @@ def play(args: argparse.Namespace) -> int:
     return OK
 
 
-def _watch(args: argparse.Namespace, population: Population) -> int:
+def _watch_members(args: argparse.Namespace, population: Population) -> int:
     from popgen.pages.game_recording import record_games
     from popgen.pages.replay_files import name_game, replay_page, to_replay, write_gif
 

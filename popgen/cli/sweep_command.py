@@ -62,7 +62,7 @@ def sweep(args: argparse.Namespace) -> int:
         tell_notes(_first_of_each_key(notes))
     configs = runs_to_start(unique, args.out, (), args.config_dir, quiet=args.quiet)
     varied = [axis.key for axis in axes if axis.key not in ("method", "env", SEED)]
-    report = _run(args, [(config, own) for config, own in zip(configs, unique, strict=True)], varied)
+    report = _run_trials(args, [(config, own) for config, own in zip(configs, unique, strict=True)], varied)
     if args.json:
         print_json(report)
     elif report["runs"]:
@@ -76,7 +76,9 @@ def sweep(args: argparse.Namespace) -> int:
     return OK
 
 
-def _run(args: argparse.Namespace, planned: Sequence[tuple[RunConfig, list[str]]], varied: list[str]) -> dict[str, Any]:
+def _run_trials(
+    args: argparse.Namespace, planned: Sequence[tuple[RunConfig, list[str]]], varied: list[str]
+) -> dict[str, Any]:
     from popgen.pipelines.sweep import SweepRun, run_sweep
     from popgen.progress import make_reporter
 

@@ -14,12 +14,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from numbers import Integral
 from typing import Any
 
 from popgen.envs.contract import BatchedEnv
 from popgen.errors import UserError
+from popgen.extensions import find_entries, load_record
 
 GROUP = "popgen.environments"
 
@@ -72,31 +73,22 @@ _GIVEN = {"self", "layout", "variant", "num_envs", "seed"}
 
 
 @cache
-def _offered() -> dict[str, EntryPoint]:
+def _find_offered() -> dict[str, EntryPoint]:
     """Families of other distributions; a built-in name cannot be taken."""
-    return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN}
+    return find_entries(GROUP, BUILT_IN)
 
 
 @cache
 def _load_family(name: str) -> EnvFamily:
     if name in BUILT_IN:
         return BUILT_IN[name]
-    entry = _offered()[name]
-    try:
-        family = entry.load()
-    except Exception as error:  # whatever a package of others raises when it is imported
-        problem = f"{name} ({entry.value}) cannot be imported: {error}"
-        raise UserError("env.name", problem, "repair its package") from None
-    if not isinstance(family, EnvFamily) or family.name != name:
-        problem = f"{entry.value} is no popgen.envs.EnvFamily with the name {name!r}"
-        raise UserError("env.name", problem, "repair its package")
-    return family
+    return load_record(_find_offered()[name], EnvFamily, "env.name")
 
 
 def env_names() -> list[str]:
     """Names that need no further parameters; a family whose package cannot be imported is left out."""
     names: list[str] = []
-    for family in (*BUILT_IN, *_offered()):
+    for family in (*BUILT_IN, *_find_offered()):
         with suppress(UserError):
             names += _load_family(family).list_names()
     return names
@@ -115,7 +107,7 @@ def make_env(name: str, /, num_envs: int = 1, *, seed: int = 0, **params: Any) -
         UserError: unknown family, variant or parameter, a batch size below 1, or a package that cannot be imported.
     """
     kind, _, variant = str(name).partition("/")
-    if kind not in BUILT_IN and kind not in _offered():
+    if kind not in BUILT_IN and kind not in _find_offered():
         raise UserError("env.name", f"unknown environment {name!r}", f"choose one of {', '.join(env_names())}")
     family = _load_family(kind)
     if variant not in family.variants and not family.is_open:  # before the parameters, which may be another one's

@@ -12,11 +12,12 @@ import difflib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from popgen.config.run_config import RunConfig, field_names
 from popgen.errors import UserError
+from popgen.extensions import find_entries, load_record
 from popgen.methods.method import Method
 from popgen.methods.recipe import Settings
 
@@ -47,9 +48,9 @@ DEFAULT_RECIPE = "laptop"
 
 
 @cache
-def _offered() -> dict[str, EntryPoint]:
+def _find_offered() -> dict[str, EntryPoint]:
     """Methods of other distributions; a built-in name cannot be taken."""
-    return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN}
+    return find_entries(GROUP, BUILT_IN)
 
 
 @cache
@@ -57,15 +58,7 @@ def _load_method(name: str) -> Method:
     if name in BUILT_IN:
         module, _, record = BUILT_IN[name].partition(":")
         return getattr(import_module(module), record)
-    entry = _offered()[name]
-    try:
-        method = entry.load()
-    except Exception as error:  # whatever a package of others raises when it is imported
-        raise UserError("method", f"{name} ({entry.value}) cannot be imported: {error}", "repair its package") from None
-    if not isinstance(method, Method) or method.name != name:
-        problem = f"{entry.value} is no popgen.methods.method.Method with the name {name!r}"
-        raise UserError("method", problem, "repair its package")
-    return method
+    return load_record(_find_offered()[name], Method, "method")
 
 
 class Methods(Mapping[str, Method]):
@@ -77,14 +70,14 @@ class Methods(Mapping[str, Method]):
         return _load_method(name)
 
     def __contains__(self, name: object) -> bool:
-        return name in BUILT_IN or name in _offered()
+        return name in BUILT_IN or name in _find_offered()
 
     def __iter__(self) -> Iterator[str]:
         yield from BUILT_IN
-        yield from _offered()
+        yield from _find_offered()
 
     def __len__(self) -> int:
-        return len(BUILT_IN) + len(_offered())
+        return len(BUILT_IN) + len(_find_offered())
 
 
 METHODS = Methods()

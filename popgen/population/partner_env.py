@@ -96,7 +96,7 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
         self._env.reset(seed=int(self.np_random.integers(2**31)))
         self._partners[self._partner].reset(1, int(self.np_random.integers(2**31)))
         self._previous[:], self._first[:] = 0, True
-        return self._look(), self._tell(0.0)
+        return self._observe_seat(), self._describe_step(0.0)
 
     def step(self, action: int) -> SeatStep:
         """The agent's action beside its partner's."""
@@ -107,17 +107,17 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
         self._previous, self._first = joint, np.zeros(1, bool)
         paid = training_reward(self._env.spec, result) if self._reward == "events" else result.reward
         ends = bool(result.terminated[0]), bool(result.truncated[0])
-        return SeatStep(self._look(), float(paid[0]), *ends, self._tell(float(result.score[0])))
+        return SeatStep(self._observe_seat(), float(paid[0]), *ends, self._describe_step(float(result.score[0])))
 
     def render(self) -> np.ndarray | None:
         """A picture (H, W, 3) uint8; None without a render mode."""
         return self._env.render_rgb(0) if self.render_mode == "rgb_array" else None
 
-    def _look(self) -> np.ndarray:
+    def _observe_seat(self) -> np.ndarray:
         seen = self._env.observe(self._view)[0, self._seat]
         return np.concatenate([seen, np.eye(2, dtype=seen.dtype)[self._seat]])
 
-    def _tell(self, score: float) -> dict[str, Any]:
+    def _describe_step(self, score: float) -> dict[str, Any]:
         population, member = self._members[self._partner]
         return {"population": population, "member": member, "seat": self._seat, "score": score}
 

@@ -250,7 +250,7 @@ def judge_members(run: RunRecord, thresholds: Thresholds, held: HeldScores | Non
         found.append(
             Quality(
                 member=member.member,
-                passed=None if one is None else _passes(one, thresholds),
+                passed=None if one is None else _passes_thresholds(one, thresholds),
                 sp=None if one is None else one.sp,
                 xp=None if one is None else one.xp,
                 taken=everything if together else before + member.real,
@@ -263,7 +263,7 @@ def judge_members(run: RunRecord, thresholds: Thresholds, held: HeldScores | Non
     return found
 
 
-def _passes(one: HeldMember, thresholds: Thresholds) -> bool:
+def _passes_thresholds(one: HeldMember, thresholds: Thresholds) -> bool:
     return one.sp.mean >= thresholds.sp and (one.xp is None or one.xp.mean <= thresholds.xp)
 
 

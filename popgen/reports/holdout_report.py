@@ -100,7 +100,7 @@ def _describe_standing(one: Standing) -> dict[str, Any]:
     }
 
 
-def _spread(scores: np.ndarray) -> dict[str, float]:
+def _describe_scores(scores: np.ndarray) -> dict[str, float]:
     spread = describe_spread(scores)
     return {"mean": spread.mean, "sd": spread.sd, "se": spread.se}
 
@@ -110,12 +110,12 @@ def _describe_controls(result: HoldoutResult) -> dict[str, Any]:
     egos, partners = [], []
     for group in casting.egos:
         rows = casting.rows(group.label)
-        beside = {name: _spread(result.ego_beside[name][rows]) for name in CONTROLS}
-        egos.append({"ego": group.label, "alone": _spread(result.ego_alone[rows]), **beside})
+        beside = {name: _describe_scores(result.ego_beside[name][rows]) for name in CONTROLS}
+        egos.append({"ego": group.label, "alone": _describe_scores(result.ego_alone[rows]), **beside})
     for group in casting.partners:
         columns = casting.columns([group.label])
-        beside = {name: _spread(result.partner_beside[name][columns]) for name in CONTROLS}
-        partners.append({"partner": group.label, "alone": _spread(result.partner_alone[columns]), **beside})
+        beside = {name: _describe_scores(result.partner_beside[name][columns]) for name in CONTROLS}
+        partners.append({"partner": group.label, "alone": _describe_scores(result.partner_alone[columns]), **beside})
     return {"egos": egos, "partners": partners}
 
 
@@ -135,7 +135,7 @@ def _list_pairs(result: HoldoutResult) -> Iterator[dict[str, Any]]:
                 names = {"ego": ego.group, "member": ego.member, "partner": partner.group}
                 scores = result.scores[r, k, seat]
                 where = {"partner_member": partner.member, "seat": seat}
-                yield {**names, **where, **_spread(scores), "scores": scores.tolist()}
+                yield {**names, **where, **_describe_scores(scores), "scores": scores.tolist()}
 
 
 def _write_notes(result: HoldoutResult) -> list[str]:

@@ -44,7 +44,7 @@ tracking: {enabled: false}
 def forget_entries() -> None:
     importlib.invalidate_caches()
     for module in (registry, env_registry):
-        module._offered.cache_clear()
+        module._find_offered.cache_clear()
     registry._load_method.cache_clear()
     env_registry._load_family.cache_clear()
 

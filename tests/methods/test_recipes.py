@@ -98,7 +98,7 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def offer_entries(*entries: Entry) -> None:
         monkeypatch.setattr(
-            registry, "_offered", lambda: {e.name: e for e in entries if e.name not in registry.BUILT_IN}
+            registry, "_find_offered", lambda: {e.name: e for e in entries if e.name not in registry.BUILT_IN}
         )
         registry._load_method.cache_clear()
 

@@ -243,13 +243,15 @@ class EgoLearner:
         totals: defaultdict[str, list[float]] = defaultdict(list)
         for _ in range(config.epochs):
             for index in torch.randperm(count, generator=self._shuffler).tensor_split(config.minibatches):
-                for name, value in self._update({name: part[:, index] for name, part in batch.items()}).items():
+                for name, value in self._update_networks(
+                    {name: part[:, index] for name, part in batch.items()}
+                ).items():
                     totals[name].append(value)
         figures |= {name: float(np.mean(values)) for name, values in totals.items()}
         self.steps += rollout.steps
         return figures | {"learning_rate": rate}
 
-    def _update(self, batch: dict[str, Tensor]) -> dict[str, float]:
+    def _update_networks(self, batch: dict[str, Tensor]) -> dict[str, float]:
         """One step of the optimiser on sequences (L, B, ...)."""
         config, net = self.config, self.net
         encoded = net.encode(batch["seen"].flatten(0, 1), batch["extras"].flatten(0, 1))

@@ -51,12 +51,12 @@ class EgoPolicy:
         if len(obs) * self._players != len(self._state):
             raise RuntimeError(f"reset(batch={len(obs)}, seed) before act on {len(obs)} rows")
         first = torch.from_numpy(np.repeat(np.asarray(is_first, bool), self._players))
-        memory = self._look(obs, previous_actions, first)
+        memory = self._encode_view(obs, previous_actions, first)
         logits = self._action_logits(memory, first)
         drawn = draw_by_gumbel(logits, self._generator).action
         return drawn.numpy().astype(np.uint8).reshape(len(obs), self._players)
 
-    def _look(self, obs: np.ndarray, previous_actions: np.ndarray, first: Tensor) -> Tensor:
+    def _encode_view(self, obs: np.ndarray, previous_actions: np.ndarray, first: Tensor) -> Tensor:
         """Take in a step; what the memory gives, (B * P, U)."""
         seats = torch.arange(self._players).repeat(len(obs))
         own = torch.from_numpy(previous_actions.astype(np.int64))

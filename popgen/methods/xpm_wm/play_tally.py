@@ -86,7 +86,7 @@ class TallyKeeper:
             self._count_states(segment.states)
 
     def _count_states(self, states: np.ndarray) -> None:
-        obs = self.env.encode(states.reshape(-1, states.shape[-1]), self.view).reshape(-1, *self._shape())
+        obs = self.env.encode(states.reshape(-1, states.shape[-1]), self.view).reshape(-1, *self._parts_shape())
         parts = zip(self.parts, self.weights, strict=True)
         values = [(obs[:, list(part)] > 0).astype(np.int64) @ weights for part, weights in parts]
         for known, value in zip(self.known, values, strict=True):
@@ -94,7 +94,7 @@ class TallyKeeper:
         for key, count in zip(*np.unique(np.sum(values, 0), return_counts=True), strict=True):
             self.visits[int(key)] = self.visits.get(int(key), 0) + int(count)
 
-    def _shape(self) -> tuple[int, ...]:
+    def _parts_shape(self) -> tuple[int, ...]:
         return self.env.spec.views[self.view].shape
 
     def tally(self, owner: int) -> Tally:

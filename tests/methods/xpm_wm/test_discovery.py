@@ -94,7 +94,7 @@ def test_the_bonus_is_that_of_the_states_that_the_model_shows() -> None:
     discovery = make(count_bonus=2.0)
     discovery.tally = tally = keeper.tally(1)
     obs = kitchen().observe()[0]
-    key = sum((obs[0][list(part)] > 0).astype(np.int64) @ w for part, w in zip(*_parts(), strict=True))
+    key = sum((obs[0][list(part)] > 0).astype(np.int64) @ w for part, w in zip(*_make_parts(), strict=True))
     visits = int(tally.visits[np.searchsorted(tally.keys, key)])
     model = model_with_events()
     for decoder in model.decoders:
@@ -109,7 +109,7 @@ def test_the_bonus_is_that_of_the_states_that_the_model_shows() -> None:
     assert torch.allclose(discovery.bonus(model, random_latent(2, 3), 2.0), torch.full((2, 3), 2.0))
 
 
-def _parts() -> tuple[Any, Any]:
+def _make_parts() -> tuple[Any, Any]:
     from popgen.methods.xpm_wm.play_tally import part_weights
 
     view = SPEC.views["features"]
