@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from popgen.cli.arguments import add_command, at_least, named_path
+from popgen.cli.arguments import add_command, at_least, named_path, share_of_one
 from popgen.cli.printing import OK, print_json, print_report
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
@@ -18,9 +18,10 @@ def add(commands: Any) -> None:
         commands,
         "diversity",
         measure,
-        "BR-Div of partners (determinant, its logarithm, effective rank), and the most diverse K of them",
+        "BR-Div of partners (determinant, its logarithm, effective rank), the most diverse K, how differently they act",
         "Over the events of the partners in play with themselves, and of their best responses beside them where all "
-        "have one (popgen evaluate --best-responses trains them). Keys of --json: those of "
+        "have one (popgen evaluate --best-responses trains them). Then, for each population, the entropy of its mean "
+        "policy and the divergence of its members' trajectories. Keys of --json: those of "
         "popgen/reports/diversity_report.py and files.",
     )
     parser.add_argument(
@@ -29,6 +30,9 @@ def add(commands: Any) -> None:
     parser.add_argument("--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them")
     parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
     parser.add_argument("--episodes", type=at_least(1), default=20, help="for each partner and seat (%(default)s)")
+    parser.add_argument(
+        "--kernel", type=share_of_one, default=0.5, help="TrajeDi's: 0 compares actions, 1 episodes (%(default)s)"
+    )
     parser.add_argument("--seed", type=at_least(0), default=0, help="(%(default)s)")
     parser.add_argument("--out", default="diversity", metavar="DIR", help="of the report (%(default)s)")
 
@@ -37,10 +41,11 @@ def measure(args: argparse.Namespace) -> int:
     """Play, count and write the report."""
     bound_threads(1)
     from popgen.envs import make_env
+    from popgen.evaluation.action_diversity import measure_groups
     from popgen.evaluation.holdout_players import open_sides
     from popgen.evaluation.partner_diversity import measure_partners
     from popgen.pipelines.best_responses import find_responses
-    from popgen.reports.diversity_report import describe_diversity, list_lines, make_sheet, write_report
+    from popgen.reports.diversity_report import describe_diversity, list_lines, list_sheets, write_report
     from popgen.reports.method_titles import title_of
     from popgen.runs.preflight import check_root
 
@@ -61,10 +66,13 @@ def measure(args: argparse.Namespace) -> int:
     if len(responses) == len(players):
         over = measure_partners(make, players, responses, args.episodes, args.seed, choose=args.choose)
         measured["best responses"] = over
-    report = describe_diversity(environment, args.episodes, args.seed, measured, len(responses))
+    acting = measure_groups(make, groups, max(2, args.episodes), args.seed, kernel=args.kernel)
+    report = describe_diversity(
+        *(environment, args.episodes, args.seed, measured, len(responses)), actions=acting, kernel=args.kernel
+    )
     files = write_report(report, args.out)
     if args.json:
         print_json({**report, "files": {name: str(path) for name, path in files.items()}})
         return OK
-    print_report([make_sheet(report).to_rich()], list_lines(report), args.out, files, width=80)
+    print_report([sheet.to_rich() for sheet in list_sheets(report)], list_lines(report), args.out, files, width=110)
     return OK

@@ -60,6 +60,7 @@ class Player:
         member: number in its population; 1 for a user's agent.
         digest: sha256 of its weights, None for a user's agent.
         make: () -> the policy.
+        part: skill or role of a member of which its population has several kinds, "" elsewhere.
     """
 
     group: str
@@ -67,6 +68,7 @@ class Player:
     member: int
     digest: str | None
     make: Callable[[], Policy]
+    part: str = ""
 
     @property
     def name(self) -> str:
@@ -159,7 +161,10 @@ def _check_environment(population: Population, environment: EnvironmentInfo) -> 
 def _describe_population(label: str, population: Population) -> Group:
     manifest = population.manifest
     players = tuple(
-        Player(label, str(population.path), info.id, info.policy_sha256, _open_member(population, info.id))
+        Player(
+            *(label, str(population.path), info.id, info.policy_sha256, _open_member(population, info.id)),
+            part=str(info.extra.get("skill") or info.extra.get("role") or ""),
+        )
         for info in population.members
     )
     digests = frozenset(info.policy_sha256 for info in population.members) - {NO_WEIGHTS}

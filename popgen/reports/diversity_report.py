@@ -1,4 +1,4 @@
-"""BR-Div of partners as JSON, CSV and Markdown.
+"""How diverse partners are as JSON, CSV and Markdown: BR-Div of what they do, and how differently they act.
 
 Keys of the JSON object (`diversity.json`):
 
@@ -11,18 +11,23 @@ Keys of the JSON object (`diversity.json`):
     over                     `members`, and `best responses` where all have one: determinant, log_determinant (null for
                              dependent partners), effective_rank, chosen (indices of partners), chosen_log_determinant,
                              chosen_effective_rank, counts (a list of mean event counts for each partner)
+    actions                  a list for the populations whose members can tell their probabilities: group, part (`all`,
+                             or the skill or role that its members have), members, entropy, own_entropy, actions,
+                             trajectories (objects: value, low, high, in nats), most, kernel
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from popgen.errors import UserError
+from popgen.evaluation.action_diversity import MeasuredActions
 from popgen.evaluation.partner_diversity import PartnerDiversity
 from popgen.jsonable import jsonable
 from popgen.population.manifest import EnvironmentInfo
@@ -33,10 +38,18 @@ CSV_FIELDS = ("over", "partner", "member", "chosen")
 
 
 def describe_diversity(
-    environment: EnvironmentInfo, episodes: int, seed: int, measured: Mapping[str, PartnerDiversity], responses: int
+    environment: EnvironmentInfo,
+    episodes: int,
+    seed: int,
+    measured: Mapping[str, PartnerDiversity],
+    responses: int,
+    *,
+    actions: Sequence[MeasuredActions] = (),
+    kernel: float = 0.0,
 ) -> dict[str, Any]:
-    """The JSON object of the module's docstring."""
+    """The JSON object of the module's docstring; `kernel` is that of the trajectories' divergence."""
     players = next(iter(measured.values())).players
+    taken = sum(one.steps for one in measured.values()) + sum(one.found.steps for one in actions)
     return jsonable(
         {
             "format": "popgen-diversity",
@@ -44,15 +57,21 @@ def describe_diversity(
             "environment": environment.model_dump(mode="json"),
             "episodes": episodes,
             "seed": seed,
-            "steps": {"evaluation": sum(one.steps for one in measured.values())},
+            "steps": {"evaluation": taken},
             "partners": [
                 {"group": one.group, "source": one.source, "member": one.member, "sha256": one.digest}
                 for one in players
             ],
             "responses": responses,
             "over": {name: _describe_one(one) for name, one in measured.items()},
+            "actions": [_describe_actions(one, kernel) for one in actions],
         }
     )
+
+
+def _describe_actions(one: MeasuredActions, kernel: float) -> dict[str, Any]:
+    figures = {name: value for name, value in asdict(one.found).items() if name != "steps"}
+    return {"group": one.group, "part": one.part, **figures, "kernel": kernel}
 
 
 def _describe_one(one: PartnerDiversity) -> dict[str, Any]:
@@ -82,6 +101,27 @@ def make_sheet(report: Mapping[str, Any]) -> Sheet:
     return Sheet(title, pd.DataFrame(cells))
 
 
+def list_sheets(report: Mapping[str, Any]) -> list[Sheet]:
+    """All tables of the report."""
+    return [make_sheet(report), *([make_actions_sheet(report)] if report["actions"] else [])]
+
+
+def make_actions_sheet(report: Mapping[str, Any]) -> Sheet:
+    """A row for each population, and for each skill or role in it."""
+    cells = []
+    for one in report["actions"]:
+        whose = one["group"] if one["part"] == "all" else f"{one['group']}, {one['part']}"
+        figures = {
+            title: f"{one[name]['value']:.3f} ({one[name]['low']:.3f} to {one[name]['high']:.3f})"
+            for name, title in _TITLES.items()
+        }
+        cells.append({"population": whose, "members": str(one["members"]), **figures})
+    return Sheet("How differently members act, in nats (95 % interval)", pd.DataFrame(cells))
+
+
+_TITLES = {"entropy": "entropy", "actions": "actions", "trajectories": "trajectories"}
+
+
 def list_lines(report: Mapping[str, Any]) -> list[str]:
     """The chosen partners, and what is missing."""
     partners, lines = report["partners"], []
@@ -92,6 +132,10 @@ def list_lines(report: Mapping[str, Any]) -> list[str]:
     if report["responses"] < len(partners):
         count = f"{report['responses']} of {len(partners)}"
         lines.append(f"{count} partners have a best response: BR-Div over these needs all of them")
+    if report["actions"]:
+        kernel = report["actions"][0]["kernel"]
+        lines.append("entropy: of the members' mean policy, over the states of their own games")
+        lines.append(f"actions, trajectories (kernel {kernel:g}): divergence, at most ln of the number of members")
     steps = report["steps"]["evaluation"]
     return [*lines, f"{report['episodes']} episodes for each partner and seat, {steps:,} environment steps"]
 
@@ -117,12 +161,13 @@ def write_report(report: Mapping[str, Any], folder: str | Path) -> dict[str, Pat
         for name, one in report["over"].items()
         for n, partner in enumerate(report["partners"])
     ]
-    sheet = make_sheet(report)
+    first, *others = list_sheets(report)
+    tables = "".join(f"\n\n## {sheet.title}\n\n{sheet.to_markdown()}" for sheet in others)
     lines = "".join(f"- {line}\n" for line in list_lines(report))
     texts = {
         "json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "csv": to_csv(rows, (*CSV_FIELDS, *(f"event_{kind}" for kind in range(kinds)))),
-        "md": f"# {sheet.title}\n\n{sheet.to_markdown()}\n\n{lines}",
+        "md": f"# {first.title}\n\n{first.to_markdown()}{tables}\n\n{lines}",
     }
     paths = {suffix: folder / f"diversity.{suffix}" for suffix in texts}
     try:
