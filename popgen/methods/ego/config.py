@@ -57,7 +57,7 @@ class EgoConfig(Schema):
     """Steps of each environment between two updates."""
     sequence: _Steps = 50
     """Steps through which gradients flow back; the memory before them is kept from the rollout."""
-    epochs: Annotated[_Int, Field(ge=1, le=1000)] = 4
+    epochs: Annotated[_Int, Field(ge=1, le=1000)] = 3
     """Passes over the data of an update."""
     minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 4
     """Gradient steps in each pass."""

@@ -151,7 +151,7 @@ class EgoLearner:
         view = env.spec.views["features"]
         self.critics = nn.ModuleDict({level: ValueNet(view, who, sizes, generator) for level in levels})
         self._learned = [*self.net.parameters(), *self.critics.parameters()]
-        self.optimiser = torch.optim.Adam(self._learned, self.config.learning_rate, eps=1e-5)
+        self.optimiser = torch.optim.Adam(self._learned, self.config.learning_rate, eps=1e-5, fused=True)
         self.sampler = EgoSampler(
             env,
             self.net,
