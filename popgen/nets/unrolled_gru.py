@@ -56,7 +56,7 @@ class _UnrolledGru(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         """Of projected, weight, bias and state."""
         weight, before, gates, new, recurrent_new, keep = ctx.saved_tensors
         time, rows, units = new.shape
