@@ -1,19 +1,102 @@
-"""XPM-Sim's workers over a transport: samplers, and the learner with its buffers and simulator."""
+"""XPM-Sim's workers: samplers, and one actor with both buffers, the exact dynamics F and a member's learner."""
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import Mapping
+from typing import Any
 
-from popgen.actors.sampler_pool import start_samplers
-from popgen.actors.simulated_agent_actor import SimulatedAgentActor
+import numpy as np
+
+from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.actors.samplers import start_samplers
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport
+from popgen.methods.xpm_sim.agent import XpmSimLearner
 from popgen.methods.xpm_sim.config import XpmSimRun
+from popgen.methods.xpm_sim.restart_check import restart_check
 from popgen.methods.xpm_sim.train import XpmSimTraining
 from popgen.methods.xpm_sim.workers import Learned, RestartCheck
-from popgen.nets.weights import Weights
+from popgen.nets.weights import Weights, weights_of
 from popgen.play.matches import Match
+
+ENVS = 64
+"""Environments from which start states are drawn at once."""
+
+
+class SimulatedAgentActor:
+    """Thin: every number is made by `XpmSimLearner`."""
+
+    def __init__(self, config: XpmSimRun, threads: int, transport: Transport) -> None:
+        limit_threads(threads)
+        self.config, self.transport = config, transport
+        self.env = build_env(config.env, ENVS, config.run.seed)
+        self._learner: XpmSimLearner | None = None
+
+    @property
+    def learner(self) -> XpmSimLearner:
+        """The running member's.
+
+        Raises:
+            RuntimeError: no member has begun.
+        """
+        if self._learner is None:
+            raise RuntimeError("begin_member comes first")
+        return self._learner
+
+    def begin_member(
+        self, member: int, seed: int, partners: Mapping[int, Pending[Weights]], encoder: Pending[State | None] | None
+    ) -> Weights:
+        """Fresh networks and buffers beside frozen predecessors (weights by member), on the shared encoder if there is
+        one; the fresh acting weights."""
+        self.env.reset(seed=seed)
+        frozen = {partner: weights.result() for partner, weights in partners.items()}
+        shared = None if encoder is None else encoder.result()
+        self._learner = XpmSimLearner(self.config.xpm_sim, self.env, member, seed, frozen, shared)
+        return self._learner.actor.weights()
+
+    def ingest(self, segments: list[Segments], strength: dict[int, float], multipliers: dict[int, float]) -> None:
+        """Real episodes into the buffers; each partner's latest cross-play return, and its multiplier."""
+        for by_kind in segments:
+            for part in by_kind.values():
+                self.learner.starts.add(part.result())
+        self.learner.partner_scores, self.learner.constraint.multipliers = dict(strength), dict(multipliers)
+
+    def learn(self, updates: int) -> Learned:
+        """Simulate and update `updates` times."""
+        began, cpu, learner = time.perf_counter(), time.process_time(), self.learner
+        steps, trajectories = learner.simulated, learner.trajectories
+        totals: dict[str, list[float]] = defaultdict(list)
+        for _ in range(updates):
+            for name, value in learner.update().items():
+                totals[name].append(value)
+        means = {name: float(np.mean(values)) for name, values in totals.items()}
+        means["update_ms"] = 1e3 * (time.perf_counter() - began) / updates
+        means["cpu_seconds"] = time.process_time() - cpu
+        acting = self.transport.put(learner.actor.weights())
+        return Learned(acting, means, learner.simulated - steps, learner.trajectories - trajectories)
+
+    def check(self) -> RestartCheck:
+        """See `restart_check`."""
+        return RestartCheck(*restart_check(self.learner, self.config.xpm_sim.check_pairs))
+
+    def encoder(self) -> State | None:
+        """The shared encoder for the next member, None without one."""
+        return None if self.learner.encoder is None else self.learner.encoder.state()
+
+    def critics(self) -> Weights:
+        """The critics' weights, which a member keeps beside its policy."""
+        return weights_of(self.learner.critics)
+
+    def state(self) -> dict[str, Any]:
+        """Of the learner, its buffers and running trajectories."""
+        return self.learner.state()
+
+    def load_state(self, state: Pending[State]) -> None:
+        """Continue from `state()`, after `begin_member` with the same partners."""
+        self.learner.load_state(state.result())
 
 
 class XpmSimWorkers:

@@ -6,10 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from popgen.actors.agent_actor import AgentActor
-from popgen.actors.replay_actor import ReplayActor
-from popgen.actors.sampler_pool import start_samplers
-from popgen.actors.world_model_actor import WorldModelActor
+from popgen.actors.samplers import start_samplers
+from popgen.actors.xpm_wm_actors import AgentActor, ReplayActor, WorldModelActor
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport, Worker

@@ -20,7 +20,7 @@ from popgen.methods.xpm_wm.start_states import OLD
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
 from popgen.nets.weights import weights_of
 from popgen.play.matches import Match
-from popgen.play.sampler import Sampler
+from popgen.play.rollout import Sampler
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
 

@@ -1,11 +1,13 @@
-"""Building blocks: multi-layer perceptrons, the layer-normalised GRU cell, convolutional encoder and decoder."""
+"""Building blocks of networks: layers, the layer-normalised GRU cell, convolutions, two-hot heads, draws of actions."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"silu": nn.SiLU, "leaky_relu": nn.LeakyReLU}
@@ -137,3 +139,72 @@ class ConvDecoder(nn.Module):
         """(B, inputs) -> (B, W, H, K)."""
         grid = self.expand(features).unflatten(-1, (self.channels, self.width, self.height))
         return self.layers(grid).permute(0, 2, 3, 1) + self.bias
+
+
+# ---- two-hot heads ---------------------------------------------------------------------------------------------------
+
+
+class TwoHot(nn.Module):
+    """Bins at symexp of an even grid over [-limit, limit]; exactly antisymmetric, so flat logits mean 0.
+
+    An odd number of bins keeps one at 0. `limit` is in symlog units: 7 covers returns of about +-1,100.
+    """
+
+    bins: Tensor
+
+    def __init__(self, bins: int, limit: float = 7.0) -> None:
+        super().__init__()
+        half = torch.expm1(torch.linspace(0.0, limit, bins // 2 + 1))[1:]
+        middle = torch.zeros(bins % 2)
+        self.register_buffer("bins", torch.cat([-half.flip(0), middle, half]), persistent=False)
+
+    def mean(self, logits: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
+        """The expected value."""
+        return (torch.softmax(logits.float(), -1) * self.bins).sum(-1)
+
+    def loss(self, logits: Float[Tensor, "*batch K"], target: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Cross-entropy (...) of the two-hot encoding of `target` (...) under logits (..., K)."""
+        bins = self.bins
+        target = target.detach().clamp(float(bins[0]), float(bins[-1])).contiguous()
+        above = torch.searchsorted(bins, target).clamp(1, len(bins) - 1)
+        low, high = bins[above - 1], bins[above]
+        weight = (target - low) / (high - low)
+        log_probs = torch.log_softmax(logits, -1)
+        below_log = log_probs.gather(-1, (above - 1).unsqueeze(-1)).squeeze(-1)
+        above_log = log_probs.gather(-1, above.unsqueeze(-1)).squeeze(-1)
+        return -((1.0 - weight) * below_log + weight * above_log)
+
+
+# ---- draws of actions ------------------------------------------------------------------------------------------------
+
+
+class DrawnActions(NamedTuple):
+    """Actions and their log-probabilities, of the same shape."""
+
+    action: Tensor
+    log_prob: Tensor
+
+
+def draw_by_inversion(
+    log_probs: Float[Tensor, "*batch A"], generator: torch.Generator | None = None
+) -> Int[Tensor, "*batch"]:
+    """By inverting the cumulative distribution: one uniform number an action, the fewest draws; for imagination."""
+    cumulative = log_probs.exp().cumsum(-1)
+    uniform = torch.rand(cumulative.shape[:-1], generator=generator, device=cumulative.device)
+    actions = (cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
+    return actions.clamp(max=cumulative.shape[-1] - 1)
+
+
+def draw_by_gumbel(logits: Float[Tensor, "*batch A"], generator: torch.Generator) -> DrawnActions:
+    """The largest of log p plus Gumbel noise, with its log-probability: no sum over actions, the fastest for the many
+    rows of a batch of simulators."""
+    log_probs = torch.log_softmax(logits, -1)
+    noise = torch.empty_like(log_probs).exponential_(generator=generator).log_()
+    actions = (log_probs - noise).argmax(-1, keepdim=True)
+    return DrawnActions(actions.squeeze(-1), log_probs.gather(-1, actions).squeeze(-1))
+
+
+def draw_by_multinomial(logits: Float[Tensor, "*batch A"], generator: torch.Generator) -> Int[Tensor, "*batch"]:
+    """By `torch.multinomial`; what archived feed-forward members act with."""
+    drawn = torch.multinomial(logits.flatten(0, -2).softmax(-1), 1, generator=generator)
+    return drawn.view(logits.shape[:-1])

@@ -1,12 +1,15 @@
-"""Who sits where: the matches that fill a batch of environments, and how they are shared out."""
+"""Who sits where: the matches that fill a batch of environments, and the policies in their seats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from popgen.play.policy import Policy, Remembering
+from popgen.shapes import check
 from popgen.types import RANDOM_MEMBER, Kind
 
 
@@ -66,3 +69,98 @@ def share_of_each(matches: Sequence[Match], parts: int, part: int) -> list[Match
         replace(match, envs=match.envs // parts + ((part + index) % parts < match.envs % parts))
         for index, match in enumerate(matches)
     ]
+
+
+class Seating:
+    """B matches drawn from K policies, and the memory that acting needs (previous actions, first steps).
+
+    A policy in both seats of a row is called once for that row. The caller steps the environment, resets the
+    rows that are done and says so through `ended`.
+
+    Args:
+        policies: K distinct policy objects.
+        seats: (B, P) int, the policy's index for each row and seat.
+
+    Raises:
+        ValueError: `seats` of a wrong shape or range, or one policy object listed twice.
+    """
+
+    def __init__(self, policies: Sequence[Policy], seats: np.ndarray) -> None:
+        self.seats = np.asarray(seats)
+        check(self.seats, (None, None), "seats")
+        if len({id(policy) for policy in policies}) != len(policies):
+            raise ValueError("policies: one object is listed twice; its memory can serve one set of rows only")
+        if self.seats.size == 0 or self.seats.min() < 0 or self.seats.max() >= len(policies):
+            raise ValueError(f"seats: need at least one row and indices in [0, {len(policies)})")
+        self.policies = list(policies)
+        # A policy that sits in no row is left alone.
+        rows = ((k, np.flatnonzero((self.seats == k).any(1))) for k in range(len(policies)))
+        self._rows = [(k, members) for k, members in rows if len(members)]
+        self._actions = np.zeros(self.seats.shape, np.uint8)
+        self._first = np.ones(len(self.seats), bool)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views that `act` needs."""
+        return tuple(sorted({self.policies[k].view for k, _ in self._rows}))
+
+    @property
+    def is_first(self) -> np.ndarray:
+        """(B,) bool: the row's next action is the first of an episode."""
+        return self._first.copy()
+
+    def reset(self, seed: int) -> None:
+        """Fresh episodes in all rows; every policy's generator is derived from `seed`."""
+        seeds = np.random.SeedSequence(seed).generate_state(len(self.policies))
+        for k, rows in self._rows:
+            self.policies[k].reset(len(rows), int(seeds[k] >> 1))
+        self._actions[:], self._first[:] = 0, True
+
+    def act(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Joint actions (B, P) uint8 on the current observations, view name -> (B, P, *view.shape)."""
+        actions = np.empty_like(self._actions)
+        for k, rows in self._rows:
+            policy, obs = self.policies[k], observations[self.policies[k].view]
+            check(obs, (len(self.seats), self.seats.shape[1], *obs.shape[2:]), f"observations[{policy.view!r}]")
+            chosen = np.asarray(policy.act(obs[rows], self._actions[rows], self._first[rows]))
+            check(chosen, (len(rows), self.seats.shape[1]), f"actions of policy {k}")
+            own = self.seats[rows] == k
+            part = actions[rows]
+            part[own] = chosen[own]
+            actions[rows] = part
+        self._actions, self._first = actions, np.zeros(len(actions), bool)
+        return actions.copy()
+
+    def ended(self, done: np.ndarray) -> None:
+        """Mark the rows (B,) bool that were reset: their next step is the first of an episode."""
+        self._first = np.asarray(done, bool).copy()
+
+    def change_seats(self, rows: np.ndarray, seats: np.ndarray, forget: np.ndarray) -> None:
+        """From the next step on other players sit in some rows, of those that sit there already.
+
+        Whoever sat in a row has followed it with its memory, and goes on with that.
+
+        Args:
+            rows: (R,) int.
+            seats: (R, P) int, the policy's index for each seat.
+            forget: (R,) bool, the row's memories are to be forgotten, as if its episode began.
+        """
+        assert all(np.isin(new, old).all() for new, old in zip(seats, self.seats[rows], strict=True))
+        self.seats = self.seats.copy()
+        self.seats[rows] = seats
+        self._first[rows] |= forget
+
+    def state(self) -> dict[str, Any]:
+        """Everything to continue from exactly here: last actions, first steps and the policies' memories."""
+        memories = {str(k): policy.memory() for k, policy in self._remembering_policies().items()}
+        return {"actions": self._actions.copy(), "first": self._first.copy(), "memories": memories}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state()` of the same seats and policies."""
+        self._actions, self._first = np.array(state["actions"]), np.array(state["first"])
+        for k, policy in self._remembering_policies().items():
+            policy.load_memory(state["memories"][str(k)])
+
+    def _remembering_policies(self) -> dict[int, Remembering]:
+        seated = ((k, self.policies[k]) for k, _ in self._rows)
+        return {k: policy for k, policy in seated if isinstance(policy, Remembering)}

@@ -1,18 +1,19 @@
-"""Full episodes of any matches in one batch of environments."""
+"""Stepping matches in one batch of environments: whole episodes, and samplers that hand on segments."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv
-from popgen.play.episodes import Episodes
+from popgen.play.episodes import Episode, Episodes
+from popgen.play.matches import Match, Seating, columns_of, match_of_columns
 from popgen.play.policy import Policy
-from popgen.play.seating import Seating
 from popgen.shapes import check
-from popgen.types import StepBatch
+from popgen.types import Segment, StepBatch
 
 
 @dataclass(frozen=True)
@@ -138,3 +139,122 @@ def play_teams(
         if progress:
             progress(start + len(seats), len(rows))
     return Episodes.concat(parts)
+
+
+class Sampler:
+    """Steps B environments with several matches at once; episodes continue from one `collect` to the next.
+
+    Args:
+        env: a batch of exactly as many environments as the matches ask for.
+        matches: who plays where, in order of the batch.
+        policies: member id -> policy; the random player is RANDOM_MEMBER.
+        name: of the sampler, for the ledger's key.
+        seed: of environments and policies.
+        stagger: spread the first ends of episodes over the horizon, so that data of all ages arrive together.
+        sequence: number of the first segment.
+    """
+
+    def __init__(
+        self,
+        env: BatchedEnv,
+        matches: list[Match],
+        policies: dict[int, Policy],
+        *,
+        name: str,
+        seed: int,
+        stagger: bool = False,
+        sequence: int = 0,
+    ) -> None:
+        if sum(match.envs for match in matches) != env.num_envs:
+            asked = sum(match.envs for match in matches)
+            raise ValueError(f"matches ask for {asked} environments, the batch has {env.num_envs}")
+        self.env, self.matches, self.name, self.sequence = env, matches, name, sequence
+        members = sorted({member for match in matches for member in match.members})
+        index = {member: position for position, member in enumerate(members)}
+        seats = np.concatenate([np.tile([[index[m] for m in match.members]], (match.envs, 1)) for match in matches])
+        self.policies = policies
+        self.seating = Seating([policies[member] for member in members], seats)
+        self.env.reset(seed=seed)
+        self.seating.reset(seed)
+        count = env.num_envs
+        self._whole = np.ones(count, bool)
+        if stagger:
+            self.env.set_time(np.arange(count) * env.spec.horizon // count)
+            self._whole[1:] = False
+        self._score = np.zeros(count)
+        self._counts = np.zeros((count, 2, env.spec.num_events), np.int64)
+        self._weights = np.asarray(env.spec.event_weights)
+
+    def state(self) -> dict[str, Any]:
+        """Everything to continue from exactly here, except matches and weights."""
+        return {
+            "env": self.env.get_state(),
+            "generator": self.env.generator_state(),
+            "seating": self.seating.state(),
+            "whole": self._whole.copy(),
+            "score": self._score.copy(),
+            "counts": self._counts.copy(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from `state()` of a sampler of the same matches."""
+        self.env.set_state(state["env"])
+        self.env.load_generator_state(state["generator"])
+        self.seating.load_state(state["seating"])
+        self._whole = np.array(state["whole"], bool).reshape(self._whole.shape)
+        self._score = np.array(state["score"], np.float64).reshape(self._score.shape)
+        self._counts = np.array(state["counts"], np.int64).reshape(self._counts.shape)
+
+    def collect(self, steps: int) -> tuple[list[Segment], list[Episode]]:
+        """Play `steps` joint steps: one segment per match, and the episodes that ended."""
+        columns, episodes = self._empty_columns(steps), []
+        for t in range(steps):
+            step = take_step(self.env, self.seating)
+            result = step.result
+            columns["states"][t], columns["next_states"][t] = step.states, step.next_states
+            columns["actions"][t], columns["events"][t] = step.actions, result.events
+            columns["reward"][t], columns["score"][t] = result.reward, result.score
+            columns["terminated"][t], columns["truncated"][t] = result.terminated, result.truncated
+            self._score += result.score
+            self._counts += result.events
+            if result.done.any():
+                episodes += self._finish_episodes(np.flatnonzero(result.done))
+            self.seating.ended(result.done)
+        return self._cut_segments(columns), episodes
+
+    def _empty_columns(self, steps: int) -> dict[str, np.ndarray]:
+        """Arrays (T, B, ...) of a segment of all matches."""
+        count, spec = self.env.num_envs, self.env.spec
+        shape = (steps, count)
+        return {
+            "states": np.empty((*shape, spec.state_size), np.dtype(spec.state_dtype)),
+            "next_states": np.empty((*shape, spec.state_size), np.dtype(spec.state_dtype)),
+            "actions": np.empty((*shape, 2), np.uint8),
+            "reward": np.empty(shape, np.float32),
+            "score": np.empty(shape, np.float32),
+            "events": np.empty((*shape, 2, spec.num_events), np.uint8),
+            "terminated": np.empty(shape, bool),
+            "truncated": np.empty(shape, bool),
+        }
+
+    def _finish_episodes(self, rows: np.ndarray) -> list[Episode]:
+        """The episodes of `rows` that began at their beginning; all of the rows are reset."""
+        numbers, episodes = match_of_columns(self.matches), []
+        for row in rows:
+            match = self.matches[numbers[row]]
+            if self._whole[row]:
+                shaped = float((self._counts[row] * self._weights).sum())
+                counts, score = self._counts[row].copy(), float(self._score[row])
+                episodes.append(Episode(match.kind, match.members, score, shaped, counts, match.owner))
+        self.env.reset(indices=rows)
+        self._whole[rows], self._score[rows], self._counts[rows] = True, 0.0, 0
+        return episodes
+
+    def _cut_segments(self, columns: dict[str, np.ndarray]) -> list[Segment]:
+        """One segment per match, numbered on."""
+        segments = []
+        for match, rows in zip(self.matches, columns_of(self.matches), strict=True):
+            part = {name: np.ascontiguousarray(column[:, rows]) for name, column in columns.items()}
+            segments.append(Segment(match.kind, match.members, **part, sampler=self.name, sequence=self.sequence))
+            self.sequence += 1
+        return segments

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
-from popgen.nets.sampling import draw_by_gumbel
+from popgen.nets.blocks import draw_by_gumbel
 from popgen.play.policy import Policy, Remembering
 
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from popgen.losses.returns import gae
+from popgen.losses.policy_losses import gae
 
 Values = Callable[[Tensor, Tensor], Tensor]
 """What all seats see (R, P, *view.shape) in columns (R,) int64 -> expected returns (R,)."""

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from popgen.envs.contract import EnvSpec, ViewSpec
+from popgen.nets.blocks import draw_by_multinomial
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
-from popgen.nets.sampling import draw_by_multinomial
 from popgen.nets.weights import load_weights, weights_of
 from popgen.shapes import check
 

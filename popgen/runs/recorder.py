@@ -24,13 +24,20 @@ from popgen.runs.directory import RunState, describe_end, named, run_folder
 from popgen.runs.ledger import Ledger
 from popgen.runs.monitoring import DiskWatch, RunLog
 from popgen.runs.provenance import note_attempt
-from popgen.runs.sinks.gauge_sink import GaugeSink
-from popgen.runs.sinks.ledger_sink import LedgerSink
-from popgen.runs.sinks.metrics_sink import MetricsSink
-from popgen.runs.sinks.mlflow_sink import MlflowSink, NoTracker, TrackerClient
-from popgen.runs.sinks.run_log_sink import RunLogSink
-from popgen.runs.sinks.sink import CheckpointWritten, MemberAdded, MetricPoint, Sink
-from popgen.runs.sinks.storage_sink import StorageSink
+from popgen.runs.sinks import (
+    CheckpointWritten,
+    GaugeSink,
+    LedgerSink,
+    MemberAdded,
+    MetricPoint,
+    MetricsSink,
+    MlflowSink,
+    NoTracker,
+    RunLogSink,
+    Sink,
+    StorageSink,
+    TrackerClient,
+)
 from popgen.runs.storage import Mirror
 from popgen.types import POPULATION, TRAINING_KINDS, Kind, LedgerEntry
 

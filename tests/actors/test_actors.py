@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.small import kitchen, random_play
 
-from popgen.actors.replay_actor import ReplayActor
-from popgen.actors.sampler_actor import SamplerActor
+from popgen.actors.samplers import SamplerActor
+from popgen.actors.xpm_wm_actors import ReplayActor
 from popgen.config.sections import EnvConfig
 from popgen.methods.training import PolicySnapshot
 from popgen.methods.transport import InlineTransport, Ready

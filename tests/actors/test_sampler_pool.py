@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from popgen.actors.sampler_pool import SamplerPool, sampler_seed
+from popgen.actors.samplers import SamplerPool, sampler_seed
 from popgen.errors import UserError
 from popgen.methods.training import PolicySnapshot
 from popgen.methods.transport import InlineWorker, Ready

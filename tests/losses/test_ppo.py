@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from popgen.losses.ppo import clipped_surrogate, negated_surrogate
+from popgen.losses.policy_losses import clipped_surrogate, negated_surrogate
 
 
 @pytest.mark.parametrize(

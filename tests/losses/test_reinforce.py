@@ -3,8 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from popgen.losses.diversity import SIGN, signed_advantage
-from popgen.losses.reinforce import ReturnScale, reinforce
+from popgen.losses.policy_losses import SIGN, ReturnScale, reinforce, signed_advantage
 from popgen.types import Kind
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from popgen.losses.returns import gae, lambda_return
+from popgen.losses.policy_losses import gae, lambda_return
 
 
 def column(*numbers: float) -> torch.Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from popgen.losses.schedules import annealed, geometric, linear
+from popgen.losses.policy_losses import annealed, geometric, linear
 
 
 def test_linear_rises_and_stays() -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from popgen.nets.two_hot import TwoHot
+from popgen.nets.blocks import TwoHot
 
 
 def test_bins_by_hand() -> None:

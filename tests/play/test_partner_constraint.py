@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from popgen.losses.diversity import bound_advantage, next_multiplier
-from popgen.play.partner_constraint import PartnerConstraint
+from popgen.losses.policy_losses import bound_advantage, next_multiplier
+from popgen.play.partner_strength import PartnerConstraint
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from support.small import kitchen, random_play
 
 from popgen.errors import UserError
-from popgen.runs.segment_files import load_segments, save_segments
+from popgen.runs.checkpoints import load_segments, save_segments
 from popgen.types import Segment
 
 

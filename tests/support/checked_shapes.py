@@ -6,8 +6,8 @@ from jaxtyping import install_import_hook
 
 CHECKED = [
     "popgen.losses",
-    "popgen.nets.sampling",
-    "popgen.nets.two_hot",
+    "popgen.nets.blocks",
+    "popgen.nets.blocks",
     "popgen.nets.feed_forward",
     "popgen.play.trajectories",
     "popgen.methods.xpm_wm.world_model",

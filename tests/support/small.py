@@ -12,7 +12,7 @@ from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.latents import Latent
 from popgen.methods.xpm_wm.replay import Query, Replay, Windows
 from popgen.play.matches import Match
-from popgen.play.sampler import Sampler
+from popgen.play.rollout import Sampler
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
 

@@ -1,7 +1,7 @@
 """PPO of a recurrent ego, of one level or two, beside critics that are told seat and partner.
 
-The objective is `popgen.losses.ppo`. One optimiser, one summed loss: both levels learn in the same unroll of the memory
-through each sequence, whose state at the beginning is the rollout's.
+The objective is `popgen.losses.policy_losses`. One optimiser, one summed loss: both levels learn in the same unroll of
+the memory through each sequence, whose state at the beginning is the rollout's.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.losses.ppo import clipped_loss
-from popgen.losses.returns import gae
-from popgen.losses.schedules import linear
+from popgen.losses.policy_losses import clipped_loss, gae, linear
 from popgen.methods.ego.augmented_starts import AugmentedStarts
 from popgen.methods.ego.config import AugmentConfig, EgoConfig, EgoRun, HiptConfig
 from popgen.methods.ego.ego_networks import EgoNet, EgoSizes

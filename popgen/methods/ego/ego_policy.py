@@ -12,7 +12,7 @@ from torch import Tensor
 from popgen.envs.contract import EnvSpec
 from popgen.methods.ego.ego_networks import EgoSizes, build_network
 from popgen.methods.ego.two_levels import draw_durations
-from popgen.nets.sampling import draw_by_gumbel
+from popgen.nets.blocks import draw_by_gumbel
 from popgen.nets.weights import Weights, load_weights, weights_of
 from popgen.shapes import check
 

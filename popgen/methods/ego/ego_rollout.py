@@ -22,8 +22,8 @@ from popgen.methods.ego.config import HiptConfig
 from popgen.methods.ego.ego_networks import EgoNet
 from popgen.methods.ego.partner_seats import PartnerSeats
 from popgen.methods.ego.two_levels import draw_durations, influence_of_skill
+from popgen.nets.blocks import draw_by_gumbel
 from popgen.nets.feed_forward import joint_copies
-from popgen.nets.sampling import draw_by_gumbel
 from popgen.play.stacked_partners import PartnerPool
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from popgen.losses.diversity import SIGN
+from popgen.losses.policy_losses import SIGN
 from popgen.methods.mappo.config import DiversityConfig
 from popgen.methods.mappo.population_bonus import PopulationBonus
 from popgen.types import Kind
@@ -16,7 +16,7 @@ class Term:
     """One expected return in an objective, beside self-play's.
 
     Attributes:
-        kind: of its trajectories; its sign is that of `popgen.losses.diversity.SIGN`.
+        kind: of its trajectories; its sign is that of `popgen.losses.policy_losses.SIGN`.
         weight: its lambda, by the recipe; 0 leaves the term out.
     """
 

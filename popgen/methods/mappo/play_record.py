@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from popgen.losses.schedules import linear
+from popgen.losses.policy_losses import linear
 from popgen.methods.mappo.config import DiversityConfig
 from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
 from popgen.play.matches import Match
-from popgen.play.partner_constraint import PartnerConstraint
-from popgen.play.partner_strength import PartnerStrength, any_then_strongest
+from popgen.play.partner_strength import PartnerConstraint, PartnerStrength, any_then_strongest
 from popgen.types import Kind
 
 

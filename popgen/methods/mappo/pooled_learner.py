@@ -15,8 +15,7 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.learner.training_data import TrainingData
 from torch import Tensor
 
-from popgen.losses.ppo import clipped_surrogate, negated_surrogate
-from popgen.losses.schedules import annealed
+from popgen.losses.policy_losses import annealed, clipped_surrogate, negated_surrogate
 from popgen.methods.mappo.pooling import Plan, PooledBatch, pool
 from popgen.methods.mappo.population_bonus import joint_log_probs
 from popgen.methods.mappo.rl_module import CRITICS, MemberModule, module_id

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import ViewSpec
-from popgen.losses.diversity import bound_advantage, signed_advantage
+from popgen.losses.policy_losses import bound_advantage, signed_advantage
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import critic_name
 from popgen.nets.feed_forward import ValueNet, joint

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from popgen.envs.contract import BatchedEnv
 from popgen.envs.reward import training_reward
-from popgen.nets.sampling import DrawnActions, draw_by_gumbel
+from popgen.nets.blocks import DrawnActions, draw_by_gumbel
 from popgen.play.episodes import Episode
 from popgen.play.matches import Match, columns_of, match_of_columns
 from popgen.types import Kind

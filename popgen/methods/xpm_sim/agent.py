@@ -17,10 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.losses.diversity import bound_advantage, signed_advantage
-from popgen.losses.ppo import clipped_loss
-from popgen.losses.reinforce import reinforce
-from popgen.losses.schedules import linear
+from popgen.losses.policy_losses import bound_advantage, clipped_loss, linear, reinforce, signed_advantage
 from popgen.methods.xpm_sim.advantages import Actions, WeightedActions
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.critics import CriticBatch, Evaluation, MemberCritics
@@ -30,8 +27,7 @@ from popgen.methods.xpm_sim.simulation import BatchColumns, Partner, SimulatedBa
 from popgen.methods.xpm_sim.simulation_starts import StartStates
 from popgen.nets import weights as w
 from popgen.nets.feed_forward import FeedForwardNet, orthogonal
-from popgen.play.partner_constraint import PartnerConstraint
-from popgen.play.partner_strength import any_or_strongest
+from popgen.play.partner_strength import PartnerConstraint, any_or_strongest
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import Kind
 

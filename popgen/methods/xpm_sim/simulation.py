@@ -18,7 +18,7 @@ from torch import Tensor
 from popgen.envs.reward import training_reward
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.simulation_starts import StartStates
-from popgen.nets.sampling import DrawnActions, draw_by_gumbel
+from popgen.nets.blocks import DrawnActions, draw_by_gumbel
 from popgen.play.trajectories import Trajectories
 
 Logits = Callable[[Tensor, Tensor], Tensor]

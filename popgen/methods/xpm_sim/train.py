@@ -38,8 +38,7 @@ from popgen.methods.xpm_sim.round_rules import MemberProgress, round_matches, sc
 from popgen.methods.xpm_sim.workers import Learned, Workers
 from popgen.nets.weights import Weights, prefixed
 from popgen.play.episodes import Episode
-from popgen.play.partner_constraint import PartnerConstraint
-from popgen.play.partner_strength import PartnerStrength
+from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 from popgen.types import Kind
 
 SIMULATED_PLAY = "simulated play"

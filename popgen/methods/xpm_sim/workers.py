@@ -59,7 +59,7 @@ class Workers(Protocol):
         self, segments: list[Segments], strength: dict[int, float], multipliers: dict[int, float]
     ) -> Pending[None]:
         """Real episodes into the buffers B_SP and B_XP; each partner's return in real cross-play, and its multiplier
-        (`popgen.play.partner_constraint`)."""
+        (`popgen.play.partner_strength`)."""
         ...
 
     def learn(self, updates: int) -> Pending[Learned]:

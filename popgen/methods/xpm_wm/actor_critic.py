@@ -7,9 +7,7 @@ from torch import Tensor, nn
 
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.latents import Latent, player_masks
-from popgen.nets.blocks import mlp
-from popgen.nets.sampling import draw_by_inversion
-from popgen.nets.two_hot import TwoHot
+from popgen.nets.blocks import TwoHot, draw_by_inversion, mlp
 
 
 class Actor(nn.Module):

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from popgen.losses.reinforce import ReturnScale
-from popgen.losses.returns import lambda_return
+from popgen.losses.policy_losses import ReturnScale, lambda_return
 from popgen.methods.xpm_wm.actor_critic import Actor, Critic
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.imagination import Imagined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from popgen.losses.schedules import geometric, linear
+from popgen.losses.policy_losses import geometric, linear
 from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig
 
 

@@ -9,9 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from popgen.losses.diversity import signed_advantage
-from popgen.losses.ppo import clipped_loss
-from popgen.losses.reinforce import reinforce
+from popgen.losses.policy_losses import clipped_loss, reinforce, signed_advantage
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent_networks import SELF, AgentNetworks
 from popgen.methods.xpm_wm.imagination import Imagined

@@ -9,7 +9,7 @@ import torch
 from support.small import AGENT, MODEL, kitchen, random_latent
 from torch import Tensor
 
-from popgen.losses.returns import lambda_return
+from popgen.losses.policy_losses import lambda_return
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner, rollout_dtype
 from popgen.methods.xpm_wm.agent_networks import SELF

@@ -6,7 +6,7 @@ import numpy as np
 from toy_popgen.guess_config import GuessRun
 from toy_popgen.habit_policy import HabitPolicy
 
-from popgen.actors.sampler_pool import SamplerPool, start_samplers
+from popgen.actors.samplers import SamplerPool, start_samplers
 from popgen.envs import EnvSpec
 from popgen.methods.training import (
     Checkpoint,

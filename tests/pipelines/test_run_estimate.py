@@ -18,7 +18,7 @@ from popgen.methods.mappo.train import RllibTraining
 from popgen.methods.training import Phase, PlannedPhase
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import plan_phases
-from popgen.runs.run_estimate import RunEstimate
+from popgen.pipelines.training_driver import RunEstimate
 
 
 class Clock:

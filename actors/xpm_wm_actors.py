@@ -1,4 +1,4 @@
-"""World-model learner actor: draws from both buffers, updates, publishes weights and start states."""
+"""Actors of XPM-WM: buffer, world-model learner, agent learner. Thin: every number is made by what they hold."""
 
 from __future__ import annotations
 
@@ -9,19 +9,81 @@ from typing import Any
 import numpy as np
 
 from popgen.actors.actor_setup import build_env, device_of, limit_threads
-from popgen.actors.replay_actor import ReplayActor
+from popgen.config.sections import EnvConfig
 from popgen.methods.training import Pending
 from popgen.methods.transport import Transport, Worker
+from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
-from popgen.methods.xpm_wm.replay import Query, Windows
+from popgen.methods.xpm_wm.play_tally import Tally, TallyKeeper
+from popgen.methods.xpm_wm.replay import Query, Replay, Windows
 from popgen.methods.xpm_wm.start_states import OLD, Starts
-from popgen.methods.xpm_wm.window_requests import Request, join
+from popgen.methods.xpm_wm.window_requests import Request, draw, join
 from popgen.methods.xpm_wm.windows import Draws, model_batch, start_batch
-from popgen.methods.xpm_wm.workers import ModelTask, ModelUpdate
+from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
-from popgen.nets.weights import Weights, under, weights_of
-from popgen.types import Kind
+from popgen.nets.weights import Weights, prefixed, under, weights_of
+from popgen.types import Kind, Segment
+
+
+class ReplayActor:
+    """Takes segments once each, serves encoded windows, and tells what it has taken in.
+
+    Args:
+        counted: view whose players' own states are counted; "" for none.
+    """
+
+    def __init__(self, env: EnvConfig, capacity: int, seed: int, counted: str = "") -> None:
+        self.replay = Replay(build_env(env, 1), capacity, seed)
+        self.keeper = TallyKeeper(self.replay.env, counted)
+        self.seen: set[tuple[str, int]] = set()
+        self.turn = 0
+
+    def ingest(self, segments: Pending[list[Segment]], owner: int) -> int:
+        """Store segments; a retried call adds nothing. Returns the rows held."""
+        for segment in segments.result():
+            key = (segment.sampler, segment.sequence)
+            if key not in self.seen:
+                self.seen.add(key)
+                self.replay.add(segment, owner)
+                self.keeper.add(segment, owner)
+        return self.replay.size
+
+    def draw(self, requests: tuple[Request, ...], length: int, view: str, repeats: int) -> list[list[Windows | None]]:
+        """For each of `repeats` updates, the windows of every request (None where nothing matches)."""
+        drawn = []
+        for _ in range(repeats):
+            drawn.append([draw(self.replay, request, length, view, self.turn) for request in requests])
+            self.turn += 1
+        return drawn
+
+    def tally(self, owner: int) -> Tally:
+        """Of all segments so far, with `owner` as the present member."""
+        return self.keeper.tally(owner)
+
+    def state(self) -> dict[str, Any]:
+        """Contents, counters and generator."""
+        seen = sorted([list(key) for key in self.seen])
+        return {"replay": self.replay.state(), "seen": seen, "turn": self.turn, "tally": self.keeper.state()}
+
+    def marks(self) -> dict[str, Any]:
+        """What `state` holds beside the contents: small enough for every iteration."""
+        return {"rng": self.replay.rng.bit_generator.state, "turn": self.turn}
+
+    def load_marks(self, marks: dict[str, Any]) -> None:
+        """Draw on from `marks()`, with contents that were added again."""
+        self.replay.rng.bit_generator.state = marks["rng"]
+        self.turn = int(marks["turn"])
+
+    def load_state(self, state: Pending[dict[str, Any]]) -> None:
+        """Continue from `state()`."""
+        contents = state.result()
+        self.replay.load_state(contents["replay"])
+        self.seen = {(str(name), int(number)) for name, number in contents["seen"]}
+        self.turn = int(contents["turn"])
+        self.keeper.load_state(contents["tally"])
+
 
 CHUNK = 25
 """Updates whose batches are drawn in one call."""
@@ -139,3 +201,61 @@ class WorldModelActor:
         contents = state.result()
         self.learner.load_state(contents["learner"])
         self.biased = bool(contents["biased"])
+
+
+class AgentActor:
+    """Thin: every number is made by `AgentLearner`."""
+
+    def __init__(self, config: XpmWmRun, threads: int, transport: Transport) -> None:
+        limit_threads(threads)
+        self.config, self.transport = config, transport
+        self.spec = build_env(config.env, 1).spec
+        self.learner = self._fresh_learner(1, 0)
+
+    def _fresh_learner(self, member: int, seed: int) -> AgentLearner:
+        config, device = self.config, device_of(self.config.cluster.agent_gpus)
+        return AgentLearner(config.agent, config.world_model, self.spec, member, seed, device, config.discovery)
+
+    def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
+        """A fresh actor and critics beside frozen predecessors (acting weights by member)."""
+        self.learner = self._fresh_learner(member, seed)
+        for partner, weights in partners.items():
+            self.learner.add_partner(partner, under("actor", weights))
+
+    def restart(self, seed: int) -> None:
+        """Fresh actor and critics on the same world model."""
+        self.learner.restart(seed)
+
+    def train(self, task: AgentTask) -> AgentUpdate:
+        """Imagine and update; what comes of it stays in the store."""
+        began, began_cpu = time.perf_counter(), time.process_time()
+        model = task.model.result()
+        self.learner.set_model(model)
+        self.learner.set_starts(task.starts.result(), task.new_share)
+        self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
+        rates: dict[str, float] = {}
+        if task.tally is not None:
+            recent = None if task.recent is None else task.recent.result()
+            rates = self.learner.compare_with_real_play(task.tally, recent)
+        totals: dict[str, list[float]] = defaultdict(list)
+        for _ in range(task.updates):
+            for name, value in self.learner.update().items():
+                totals[name].append(value)
+        means = {name: float(np.mean(values)) for name, values in totals.items()} | rates
+        means["seconds"] = time.perf_counter() - began
+        means["cpu_seconds"] = time.process_time() - began_cpu
+        means["update_ms"] = 1000.0 * means["seconds"] / task.updates
+        acting, critics = self.acting_weights(model), weights_of(self.learner.critics)
+        return AgentUpdate(MemberWeights(self.transport.put(acting), self.transport.put(critics), task.model), means)
+
+    def acting_weights(self, model: Weights) -> Weights:
+        """Policy weights: the filter of `model` and this member's actor."""
+        return prefixed("filter", under("filter", model)) | prefixed("actor", self.learner.actor_weights())
+
+    def state(self) -> dict[str, Any]:
+        """Of the learner: everything but the world model and the start states, which come with every task."""
+        return self.learner.state()
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`, after `begin_member` with the same partners."""
+        self.learner.load_state(state)

@@ -1,0 +1,288 @@
+"""Where a run's records go: what the recorder tells its sinks, and one sink each for ledger, metrics, MLflow, gauges,
+run log and storage copy. A sink overrides what it wants to know; each can be left out."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from popgen.durable_files import read_regular, replace_file
+from popgen.errors import UserError
+from popgen.runs.ledger import Ledger
+from popgen.runs.monitoring import RunLog, gauge, show_figures
+from popgen.runs.storage import Mirror
+from popgen.types import Kind, LedgerEntry
+
+
+@dataclass(frozen=True)
+class MetricPoint:
+    """Figures of a member after so many of its environment steps; `free_bytes` of the disk, where it was looked at."""
+
+    member: int
+    step: int
+    figures: Mapping[str, float]
+    free_bytes: int | None = None
+
+
+@dataclass(frozen=True)
+class CheckpointWritten:
+    """A checkpoint is whole on disk, after `iteration` iterations and `steps` environment steps of `member`."""
+
+    member: int
+    iteration: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class MemberAdded:
+    """The population has one more member.
+
+    Attributes:
+        steps: environment steps of its training.
+        total_steps: of all members so far.
+        following: the member that is trained next, None after the last one.
+        kinds: of all members so far by kind, simulated ones among them.
+    """
+
+    member: int
+    steps: int
+    total_steps: int
+    following: int | None
+    kinds: Mapping[str, int] = field(default_factory=dict)
+
+
+class Sink:
+    """Ignores everything."""
+
+    def on_entries(self, entries: Sequence[LedgerEntry]) -> None:
+        """Environment steps were taken."""
+
+    def on_metrics(self, point: MetricPoint) -> None:
+        """A point of metrics."""
+
+    def on_checkpoint(self, checkpoint: CheckpointWritten) -> None:
+        """A checkpoint was written."""
+
+    def on_member(self, added: MemberAdded) -> None:
+        """A member was added to the population."""
+
+    def on_end(self, status: str) -> None:
+        """The run ends with an MLflow status: FINISHED, FAILED or KILLED."""
+
+
+class LedgerSink(Sink):
+    """Counts every entry once."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+
+    def on_entries(self, entries: Sequence[LedgerEntry]) -> None:
+        """Record and flush."""
+        for entry in entries:
+            self.ledger.record(entry)
+        self.ledger.flush()
+
+    def on_end(self, status: str) -> None:
+        """Flush what a full disk may have kept back."""
+        self.ledger.flush()
+
+
+class MetricsSink(Sink):
+    """Appends a line for each point. A process that died while it wrote one left half a line, which is cut off."""
+
+    def __init__(self, folder: Path, began: float) -> None:
+        self.path, self.began = folder / "metrics.jsonl", began
+        data = read_regular(self.path) if self.path.exists() else b""
+        if data and not data.endswith(b"\n"):
+            os.truncate(self.path, data.rfind(b"\n") + 1)
+
+    def on_metrics(self, point: MetricPoint) -> None:
+        """One line: member, step, seconds of this attempt, figures."""
+        row = {"member": point.member, "step": point.step, "seconds": round(time.time() - self.began, 2)}
+        figures = {name: _round_figure(value) for name, value in point.figures.items()}
+        with self.path.open("a") as file:
+            file.write(json.dumps(row | figures) + "\n")
+
+
+def _round_figure(value: float) -> float | None:
+    return round(float(value), 5) if math.isfinite(value) else None
+
+
+class TrackerClient(Protocol):
+    """The recorder's end of a tracker, see `popgen.runs.mlflow_tracker.Tracker`."""
+
+    def start(self, resume: Mapping[str, Any] | None = None) -> None:
+        """Open the store; `resume` is what `flush` gave in an earlier attempt."""
+
+    def forget(self) -> None:
+        """Its process is gone; `start` makes another one."""
+
+    def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
+        """Metrics of the population (member None) or of one member."""
+
+    def log_scaling(self, members: int, environment_steps: int, kinds: Mapping[str, int] | None = None) -> None:
+        """Environment steps so far, in all and by kind, with step = number of members."""
+
+    def describe(self, text: str, overview: str = "") -> None:
+        """Markdown of the run and of its experiment."""
+
+    def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
+        """Copy a file or folder."""
+
+    def flush(self) -> dict[str, Any]:
+        """Wait until everything is written; what a later tracker needs to continue."""
+        ...
+
+    def finish(self, status: str) -> None:
+        """End all MLflow runs."""
+
+
+class NoTracker:
+    """A run without MLflow."""
+
+    def start(self, resume: Mapping[str, Any] | None = None) -> None:
+        """There is no store to open."""
+
+    def forget(self) -> None:
+        """There is no process."""
+
+    def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
+        """Ignore metrics."""
+
+    def log_scaling(self, members: int, environment_steps: int, kinds: Mapping[str, int] | None = None) -> None:
+        """Ignore the figures."""
+
+    def describe(self, text: str, overview: str = "") -> None:
+        """Ignore the text."""
+
+    def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
+        """Ignore the file."""
+
+    def flush(self) -> dict[str, Any]:
+        """There are no MLflow runs."""
+        return {}
+
+    def finish(self, status: str) -> None:
+        """There is nothing to end."""
+
+
+class MlflowSink(Sink):
+    """Hands points on. A resumed run continues in the same MLflow runs.
+
+    Raises:
+        UserError: tracking.json cannot be read.
+    """
+
+    def __init__(self, folder: Path, tracker: TrackerClient, attempt: int) -> None:
+        self.path, self.tracker = folder / "tracking.json", tracker
+        runs = self._read_runs()
+        self.resume = runs if runs or attempt > 1 else None
+
+    def start(self) -> None:
+        """Open the store and keep the run ids; needs Ray where the tracker is an actor."""
+        self.tracker.start(self.resume)
+        self.save_runs()
+
+    def save_runs(self) -> None:
+        """Keep the MLflow run ids."""
+        replace_file(self.path, json.dumps(self.tracker.flush()).encode())
+
+    def on_metrics(self, point: MetricPoint) -> None:
+        """A member's figures."""
+        self.tracker.log(point.figures, step=point.step, member=point.member)
+
+    def on_member(self, added: MemberAdded) -> None:
+        """One more point of the scaling figure."""
+        self.tracker.log_scaling(added.member, added.total_steps, added.kinds)
+        self.save_runs()
+
+    def on_end(self, status: str) -> None:
+        """End the MLflow runs."""
+        self.tracker.finish(status)
+
+    def _read_runs(self) -> dict[str, Any]:
+        try:
+            text = json.loads(read_regular(self.path)) if self.path.exists() else {}
+            runs = text.get("runs", {}) if isinstance(text, dict) else None
+            if not isinstance(runs, dict) or not all(isinstance(run, str) for run in runs.values()):
+                raise ValueError("it holds no runs")
+        except (OSError, ValueError, RecursionError) as error:
+            raise UserError(str(self.path), f"cannot be read ({error})", "remove it: MLflow gets new runs") from None
+        return text
+
+
+class GaugeSink(Sink):
+    """Sets the gauges that `popgen.runs.monitoring.GAUGES` lists."""
+
+    def __init__(self, run: str, ledger: Ledger) -> None:
+        self.run, self.ledger = run, ledger
+
+    def on_entries(self, entries: Sequence[LedgerEntry]) -> None:
+        """Totals by kind."""
+        for kind in Kind:
+            if steps := self.ledger.steps(kind=kind):
+                gauge("popgen_environment_steps", steps, run=self.run, kind=str(kind))
+
+    def on_metrics(self, point: MetricPoint) -> None:
+        """The member's score, the learners' speed, room on the disk."""
+        if point.free_bytes is not None:
+            gauge("popgen_disk_free_bytes", point.free_bytes, run=self.run)
+        show_figures(self.run, point.member, point.figures)
+
+    def on_checkpoint(self, checkpoint: CheckpointWritten) -> None:
+        """Iterations of the member in training."""
+        gauge("popgen_iteration", checkpoint.iteration, run=self.run, member=str(checkpoint.member))
+
+    def on_member(self, added: MemberAdded) -> None:
+        """Members in the population."""
+        gauge("popgen_members", added.member, run=self.run)
+
+
+class RunLogSink(Sink):
+    """Writes to the run's log. Its last line is the recorder's, whatever the other sinks raise."""
+
+    def __init__(self, log: RunLog) -> None:
+        self.log = log
+
+    def on_checkpoint(self, checkpoint: CheckpointWritten) -> None:
+        """Lines are from now on of this member and iteration."""
+        self.log.place = {"member": checkpoint.member, "iteration": checkpoint.iteration}
+        self.log.write("checkpoint", steps=checkpoint.steps)
+
+    def on_member(self, added: MemberAdded) -> None:
+        """Lines are from now on of the following member."""
+        self.log.write("member", member=added.member, steps=added.steps)
+        self.log.place = {} if added.following is None else {"member": added.following}
+
+
+class StorageSink(Sink):
+    """Pushes the folder; a copy that was not taken is a line of the run's log."""
+
+    def __init__(self, mirror: Mirror, log: RunLog) -> None:
+        self.mirror, self.log = mirror, log
+
+    def on_checkpoint(self, checkpoint: CheckpointWritten) -> None:
+        """Copy what has changed."""
+        self._push_copy()
+
+    def on_member(self, added: MemberAdded) -> None:
+        """Copy what has changed."""
+        self._push_copy()
+
+    def on_end(self, status: str) -> None:
+        """Copy a finished run."""
+        if status == "FINISHED":
+            self._push_copy()
+
+    def _push_copy(self) -> None:
+        try:
+            self.mirror.push()
+        except OSError as error:
+            text = f"{self.mirror.uri} did not take a copy ({' '.join(str(error).split())[:200]})"
+            self.log.write("note", level="WARNING", text=text)
