@@ -14,13 +14,11 @@ from popgen.methods.training import Pending
 from popgen.methods.transport import Transport, Worker
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.imagination import OLD, Starts
 from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
-from popgen.methods.xpm_wm.play_tally import Tally, TallyKeeper
-from popgen.methods.xpm_wm.replay import Query, Replay, Windows
-from popgen.methods.xpm_wm.start_states import OLD, Starts
-from popgen.methods.xpm_wm.window_requests import Request, draw, join
-from popgen.methods.xpm_wm.windows import Draws, model_batch, start_batch
+from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper
+from popgen.methods.xpm_wm.replay import Draws, Query, Replay, Request, Windows, draw, join, model_batch, start_batch
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
 from popgen.nets.weights import Weights, prefixed, under, weights_of

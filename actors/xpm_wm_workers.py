@@ -12,9 +12,9 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport, Worker
 from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
-from popgen.methods.xpm_wm.play_tally import Tally
-from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match

@@ -13,7 +13,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.ego.config import EgoRun
 from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup
 from popgen.methods.registry import recipe
-from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.play.policy import Policy
 from popgen.policies.feed_forward_policy import FeedForwardPolicy

@@ -15,8 +15,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.imagination import OLD
 from popgen.methods.xpm_wm.replay import Query, Replay, Windows
-from popgen.methods.xpm_wm.start_states import OLD
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
 from popgen.nets.weights import weights_of
 from popgen.play.matches import Match

@@ -60,7 +60,7 @@ def model_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from popgen.cli.compose import compose
     from popgen.config.run_config import RunConfig
     from popgen.envs import make_env
-    from popgen.methods.xpm_wm.acting import WorldModelPolicy
+    from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
     from popgen.population import PopulationWriter
 
     run = tmp_path_factory.mktemp("run") / "old"

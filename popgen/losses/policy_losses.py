@@ -119,7 +119,7 @@ def clipped_surrogate(
 ) -> Float[Tensor, "*rows"]:
     """-min(r A, clip(r, 1 - c, 1 + c) A) with r = pi / pi_old, elementwise, to be minimised.
 
-    The advantage carries the objective's sign already (`losses.diversity.signed_advantage`): where cross-play returns
+    The advantage carries the objective's sign already (`signed_advantage`): where cross-play returns
     are minimised, -A stands here, so that the clipping bounds the step that lowers them. It carries no gradient.
     """
     ratio = torch.exp(log_prob - old_log_prob.detach())

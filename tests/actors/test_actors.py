@@ -11,8 +11,7 @@ from popgen.actors.xpm_wm_actors import ReplayActor
 from popgen.config.sections import EnvConfig
 from popgen.methods.training import PolicySnapshot
 from popgen.methods.transport import InlineTransport, Ready
-from popgen.methods.xpm_wm.replay import Query
-from popgen.methods.xpm_wm.window_requests import Request
+from popgen.methods.xpm_wm.replay import Query, Request
 from popgen.play.matches import Match
 from popgen.types import RANDOM_MEMBER, Kind
 

@@ -12,7 +12,7 @@ from support.small import kitchen, random_play
 from popgen.actors.checkpoint_writer import CheckpointFiles, resolve_handles
 from popgen.methods.training import Segments
 from popgen.methods.transport import Ready
-from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.imagination import Starts
 from popgen.runs.state_files import load_state
 from popgen.types import Kind
 

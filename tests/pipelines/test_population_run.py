@@ -24,7 +24,7 @@ from popgen.errors import UserError
 from popgen.methods.training import Collected, Round, TrainedMember
 from popgen.methods.transport import InlineTransport, Ready
 from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress
-from popgen.methods.xpm_wm.play_tally import Tally
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.replay import KIND_CODE
 from popgen.methods.xpm_wm.train import FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import ModelTask, Setup

@@ -7,7 +7,7 @@ import pytest
 import torch
 from support.small import AGENT, MODEL, kitchen
 
-from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.play.policy import Policy
 from popgen.play.stacked_partners import PartnerPool, Stackable
 from popgen.policies.feed_forward_policy import FeedForwardPolicy

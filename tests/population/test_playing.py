@@ -11,7 +11,7 @@ import popgen
 from popgen.envs import make_env
 from popgen.envs.parallel import parallel_env
 from popgen.errors import UserError
-from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import XpmWmRun
 
 

@@ -11,10 +11,10 @@ CHECKED = [
     "popgen.nets.feed_forward",
     "popgen.play.trajectories",
     "popgen.methods.xpm_wm.world_model",
-    "popgen.methods.xpm_wm.world_model_losses",
-    "popgen.methods.xpm_wm.latents",
-    "popgen.methods.xpm_wm.agent_networks",
-    "popgen.methods.xpm_wm.agent_targets",
+    "popgen.methods.xpm_wm.world_model",
+    "popgen.methods.xpm_wm.latent_filter",
+    "popgen.methods.xpm_wm.agent_update",
+    "popgen.methods.xpm_wm.agent_update",
 ]
 """Modules whose public functions name the dimensions of their arrays."""
 

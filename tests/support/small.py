@@ -9,7 +9,7 @@ from torch import Tensor
 
 from popgen.envs import BatchedEnv, make_env
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
-from popgen.methods.xpm_wm.latents import Latent
+from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.replay import Query, Replay, Windows
 from popgen.play.matches import Match
 from popgen.play.rollout import Sampler

@@ -2,7 +2,7 @@
 
     minimise  sum over kinds of  mean over that kind's rows of  surrogate(sign * weight * advantage / scale)
 
-A row is a step of one seat that the member's present policy played. The signs are those of `losses.diversity`.
+A row is a step of one seat that the member's present policy played. The signs are those of `losses.policy_losses`.
 Advantages of each kind are centred; `scale` is their standard deviation or self-play's, whichever is larger. Divided by
 its own alone, cross-play would keep pushing with full weight when its returns are nearly zero; by self-play's alone, it
 would drown a beginner's self-play, whose returns are small beside what a trained partner earns.

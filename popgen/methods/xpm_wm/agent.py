@@ -16,31 +16,61 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec
+from popgen.losses.policy_losses import geometric, linear
 from popgen.methods.xpm_wm.actor_critic import Actor
-from popgen.methods.xpm_wm.agent_networks import AgentNetworks
-from popgen.methods.xpm_wm.agent_schedules import cross_play_weight, entropy_scale
-from popgen.methods.xpm_wm.agent_targets import (
+from popgen.methods.xpm_wm.agent_update import (
+    AgentNetworks,
     PolicyTarget,
+    cast_automatically,
     cross_play_target,
+    learn_batch,
     self_play_target,
 )
-from popgen.methods.xpm_wm.batch_learning import cast_automatically, learn_batch
 from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig, WorldModelConfig
-from popgen.methods.xpm_wm.discovery import Discovery
-from popgen.methods.xpm_wm.imagination import Imagined, JointActor, expected_pay, imagine
-from popgen.methods.xpm_wm.imagined_play import (
+from popgen.methods.xpm_wm.imagination import (
+    NEW_SP,
+    Discovery,
+    Imagined,
     ImaginedPlay,
+    JointActor,
+    Starts,
     cross_play_seats,
     draw_start_rows,
+    expected_pay,
+    imagine,
     joint_actor,
     start_latents,
 )
-from popgen.methods.xpm_wm.latents import Latent
-from popgen.methods.xpm_wm.play_tally import Tally
-from popgen.methods.xpm_wm.start_states import NEW_SP, Starts
+from popgen.methods.xpm_wm.latent_filter import Latent
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
 from popgen.play.partner_strength import any_or_strongest
+
+
+def cross_play_weight(config: AgentConfig, updates: int) -> float:
+    """lambda_XP after so many updates: rising from `lambda_start`, if that is less, to `lambda_xp` over `lambda_ramp`.
+
+    Cross-play pressure must be there from the first update, or the member settles on its predecessor's convention; at
+    full strength from the start it keeps self-play from starting at all.
+    """
+    start = min(config.lambda_start, config.lambda_xp)
+    return linear(start, config.lambda_xp, updates, config.lambda_ramp)
+
+
+def entropy_scale(config: AgentConfig, discovery: DiscoveryConfig, finding: int, playing: int) -> float:
+    """Of the bonus: `entropy`, then falling to `found_entropy` over the updates since the dearest event was found, and
+    to `entropy_end` over those since self-play has started, each within `entropy_ramp` and by the same factor in each.
+
+    In units of the returns' range, which grows tenfold once dishes are delivered, advantages shrink: a scale that lets
+    self-play start would then win over them, and the policy would get more random the better it plays.
+    """
+    scale, ramp = config.entropy, config.entropy_ramp
+    if ramp and finding:
+        scale = geometric(scale, min(discovery.found_entropy, scale), finding, ramp)
+    if ramp and playing:
+        scale = geometric(scale, min(config.entropy_end, scale), playing, ramp)
+    return scale
 
 
 def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) -> torch.dtype:  # noqa: B008

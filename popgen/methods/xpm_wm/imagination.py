@@ -1,25 +1,90 @@
-"""Imagined trajectories.
+"""Imagination: states to start from, the prior rolled forward under joint actors, what it pays, and what is believed.
 
-Alignment (H the horizon):
-
-    t           0           1                 H
-    latents    (h,z)_0 --- (h,z)_1 --- ... --- (h,z)_H
-    actions         a_0         a_1   ...
-    reward          r_1         r_2   ...  r_H      what arriving in (h,z)_{t+1} earned, stored in row t
-    running    1         c_1      c_1 c_2  ...      probability that the episode still runs in row t
+The rollout is Algorithm 1's lines 8 and 10. `Discovery` is for tasks where a reward lies behind a long chain of events
+that play does not show yet (docs/notes/learning.md, The counter circuit): a bonus for states of a player that real play
+has hardly seen, events that count only as far as they happen in reality as often as in imagination, and trajectories
+that end where the model has seen too little to go on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from popgen.methods.xpm_wm.latents import Latent
-from popgen.methods.xpm_wm.world_model import WorldModel
+from popgen.envs.contract import EnvSpec
+from popgen.methods.xpm_wm.actor_critic import Actor
+from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig
+from popgen.methods.xpm_wm.latent_filter import Latent, from_indices
+from popgen.methods.xpm_wm.real_play import Tally, part_weights
+from popgen.methods.xpm_wm.replay import NEW_SP, NEW_XP, OLD
+from popgen.methods.xpm_wm.world_model import PlayerDecoder, WorldModel
+
+# ---- states to start from --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Posteriors of real states. h (N, D) float32; z (N, G) uint8 class indices; pool (N,) uint8: OLD data of
+    earlier members and random play, NEW_SP, NEW_XP; partner (N,) int16 of cross-play rows, 0 elsewhere.
+    """
+
+    h: np.ndarray
+    z: np.ndarray
+    pool: np.ndarray
+    partner: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pool)
+
+    @staticmethod
+    def concat(parts: list[Starts]) -> Starts:
+        """All parts in order."""
+        columns = ("h", "z", "pool", "partner")
+        return Starts(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+
+
+def draw_self_play(
+    starts: Starts, count: int, new_share: float, from_xp: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Rows for imagined self-play: SP *and* XP states (paper, eq. XPM-Sim), which makes mixed play unnecessary.
+
+    `new_share` of them come from this member's own data if there is any, of which `from_xp` from cross-play.
+    """
+    pools = [np.flatnonzero(starts.pool == pool) for pool in (OLD, NEW_SP, NEW_XP)]
+    shares = np.array([1.0 - new_share, new_share * (1.0 - from_xp), new_share * from_xp])
+    return _draw_mixture(pools, shares, count, rng)
+
+
+def draw_cross_play(
+    starts: Starts, count: int, new_share: float, partner: int | None, rng: np.random.Generator
+) -> np.ndarray:
+    """Rows for imagined cross-play with `partner`: XP states recorded with that partner (None: any partner).
+
+    Until such states exist, and for the share of old data, the kept buffer stands in (Algorithm 1 fills
+    B_XP with random episodes before anything else).
+    """
+    own = starts.pool == NEW_XP
+    if partner is not None:
+        own = own & (starts.partner == partner)
+    pools = [np.flatnonzero(starts.pool == OLD), np.flatnonzero(own)]
+    return _draw_mixture(pools, np.array([1.0 - new_share, new_share]), count, rng)
+
+
+def _draw_mixture(pools: list[np.ndarray], shares: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    shares = np.where([len(pool) > 0 for pool in pools], np.maximum(shares, 1e-9), 0.0)
+    if not shares.any():
+        raise LookupError("there are no states to start imagination from")
+    sizes = rng.multinomial(count, shares / shares.sum())
+    return np.concatenate([rng.choice(pool, size) for pool, size in zip(pools, sizes, strict=True) if size])
+
+
+# ---- the rollout -----------------------------------------------------------------------------------------------------
+
 
 JointActor = Callable[[Latent], Tensor]
 """Joint actions (B, P) int64 for a batch of model states."""
@@ -80,3 +145,197 @@ def imagine(
     reward, keep = pay(model, latent[1:])
     running = torch.cat([torch.ones_like(keep[:1]), keep[:-1]]).cumprod(0)
     return Imagined(latent, torch.stack(actions), reward, keep, running)
+
+
+# ---- a batch of self-play and cross-play -----------------------------------------------------------------------------
+
+
+class ImaginedPlay(NamedTuple):
+    """Self-play columns and, after them, cross-play columns; in the latter, the agent's seat (C,) int64."""
+
+    imagined: Imagined
+    seats: Tensor
+
+
+def draw_start_rows(
+    config: AgentConfig, starts: Starts, new_share: float, partner: int | None, rng: np.random.Generator
+) -> np.ndarray:
+    """Rows of `starts` for a batch: `starts_sp` of self-play and, with a partner, `starts_xp` of cross-play."""
+    rows = draw_self_play(starts, config.starts_sp, new_share, config.sp_from_xp, rng)
+    if partner is None or not config.starts_xp:
+        return rows
+    only = partner if config.xp_starts == "partner" else None
+    return np.concatenate([rows, draw_cross_play(starts, config.starts_xp, new_share, only, rng)])
+
+
+def start_latents(starts: Starts, rows: np.ndarray, classes: int, device: torch.device, dtype: torch.dtype) -> Latent:
+    """The stored model states of `rows`."""
+    z = from_indices(torch.from_numpy(starts.z[rows]).to(device), classes).flatten(-2)
+    return Latent(torch.from_numpy(starts.h[rows]).to(device, dtype), z.to(dtype))
+
+
+def cross_play_seats(count: int, device: torch.device) -> Tensor:
+    """(count,) the agent's seat: 0 in the first half, 1 in the second."""
+    return (torch.arange(count, device=device) >= count // 2).long()
+
+
+def joint_actor(own: Actor, partner: Actor | None, first: int, seats: Tensor, generator: torch.Generator) -> JointActor:
+    """Both seats by `own`, but for the other seat than `seats` in the columns from `first` on, which is `partner`'s."""
+    both = torch.tensor([0, 1], device=seats.device)
+    columns = first + torch.arange(len(seats), device=seats.device)
+
+    def act(latent: Latent) -> Tensor:
+        pair = latent.expand_players()
+        actions = own.sample(pair, both.expand(pair.h.shape[:-1]), generator)
+        if partner is not None:
+            actions[columns, 1 - seats] = partner.sample(latent[first:], 1 - seats, generator)
+        return actions
+
+    return act
+
+
+# ---- what is believed, and what real play has hardly seen ------------------------------------------------------------
+
+
+LEAST_TRUST = 0.01
+"""Share of its weight that an imagined event keeps in any case."""
+NEWEST = 0.5
+"""Weight of the latest rates in their moving averages."""
+
+
+class Rates(NamedTuple):
+    """Events of each type in a step of the task, (E,) float64: in imagination and in real play."""
+
+    imagined: np.ndarray
+    real: np.ndarray
+
+
+def trusted_shares(rates: Rates, factor: float) -> np.ndarray:
+    """(E,) float64 within [LEAST_TRUST, 1]: what an imagined event counts for, `factor` times its real rate over its
+    imagined one."""
+    return np.clip(factor * rates.real / np.maximum(rates.imagined, 1e-12), LEAST_TRUST, 1.0)
+
+
+def dearest_events(spec: EnvSpec) -> np.ndarray:
+    """(E,) bool: events that pay at least half of what the dearest pays."""
+    weights = np.asarray(spec.event_weights)
+    return weights >= max(0.5 * weights.max(), 1e-9)
+
+
+class Discovery:
+    """What an agent's learner knows of real play beside the world model.
+
+    Give it a tally before updates; nothing changes in imagination where all options are off.
+
+    Attributes:
+        tally: of real play; None before there is one.
+        shares: (E,) what an imagined event counts for.
+        rates: moving averages, from the first comparison on.
+        seen: events and steps of the member's own play at the last comparison.
+    """
+
+    def __init__(self, config: DiscoveryConfig, spec: EnvSpec, view: str, device: torch.device) -> None:
+        self.config, self.spec, self.view, self.device = config, spec, spec.views[view], device
+        factors = [config.event_factors.get(name, 1.0) for name in spec.event_names]
+        self.weights = np.asarray(spec.event_weights, np.float64) * factors
+        self.dearest = dearest_events(spec)
+        self.tally: Tally | None = None
+        self.shares = np.ones(spec.num_events)
+        self.rates: Rates | None = None
+        self.seen = (np.zeros(spec.num_events, np.int64), 0)
+
+    @property
+    def changes_pay(self) -> bool:
+        """Whether what imagined events pay differs from the environment's weights."""
+        return bool(self.config.event_factors or self.config.trust or self.config.rare_events)
+
+    def found(self) -> bool:
+        """Whether the dearest event has been seen often enough to count as found."""
+        if self.tally is None or not self.config.found_events:
+            return False
+        return int(self.tally.events[self.dearest].sum()) >= self.config.found_events
+
+    def bonus_scale(self, plays: bool) -> float:
+        """Of the count bonus: halved once the dearest event has been found, none once real self-play has begun."""
+        if plays or self.tally is None:
+            return 0.0
+        return self.config.count_bonus * (0.5 if self.found() else 1.0)
+
+    # ---- pay ---------------------------------------------------------------------------------------------------------
+
+    def pay(self, model: WorldModel, arrived: Latent) -> Paid:
+        """Reward and continuation of imagined states; an event that has been seen too rarely pays and ends them."""
+        events = model.event_probs(arrived).float()
+        players = self.spec.num_players
+        weights = torch.as_tensor(np.tile(self.weights * self.shares, players), dtype=torch.float32)
+        keep = model.continuation(arrived).float()
+        if self.config.rare_events and self.tally is not None:
+            rare = np.tile(self.tally.events < self.config.rare_events, players)
+            happened = (events > 0.5) & torch.as_tensor(rare, device=self.device)
+            keep = torch.where(happened.any(-1), torch.zeros_like(keep), keep)
+        return Paid((events * weights.to(self.device)).sum(-1), keep)
+
+    def bonus(self, model: WorldModel, arrived: Latent, scale: float) -> Tensor:
+        """(...,) float32: for each player `scale` / sqrt(1 + n), n the real visits of the state of its own that the
+        model shows. A state with a part that was never seen is no new combination, but a blur: it earns nothing."""
+        assert self.tally is not None
+        total = torch.zeros(arrived.h.shape[:-1], device=self.device)
+        weights = part_weights(self.view)
+        columns = torch.tensor([entry for part in self.view.own for entry in part], device=self.device)
+        for player, decoder in enumerate(model.decoders):
+            assert isinstance(decoder, PlayerDecoder)
+            shown = decoder.entries(model.player_latent(arrived, player), columns) > 0.0
+            parts = shown.split([len(part) for part in self.view.own], -1)
+            values = [
+                (part * torch.as_tensor(one, device=self.device)).sum(-1)
+                for part, one in zip(parts, weights, strict=True)
+            ]
+            total += self._bonus_of(values)
+        return scale * total
+
+    def _bonus_of(self, values: list[Tensor]) -> Tensor:
+        """1 / sqrt(1 + n) of states with these values of their parts."""
+        assert self.tally is not None
+        valid = torch.ones_like(values[0], dtype=torch.bool)
+        for value, known in zip(values, self.tally.known, strict=True):
+            valid &= torch.isin(value, torch.as_tensor(known, device=self.device))
+        key = torch.stack(values).sum(0)
+        keys = torch.as_tensor(self.tally.keys, device=self.device)
+        at = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
+        visits = torch.as_tensor(self.tally.visits, device=self.device)[at] * (keys[at] == key)
+        return valid / torch.sqrt(1.0 + visits)
+
+    # ---- trust -------------------------------------------------------------------------------------------------------
+
+    def compare(self, imagined: np.ndarray, tally: Tally) -> dict[str, float]:
+        """Take in imagined events a step (E,), and the real ones since the last comparison; figures of both."""
+        events, steps = self.seen
+        played = tally.own_steps - steps
+        if played < 1:
+            return {}
+        new = Rates(imagined, (tally.own_events - events + 0.5) / played)
+        self.seen = (tally.own_events, tally.own_steps)
+        old = self.rates or new
+        mixed = [(1.0 - NEWEST) * before + NEWEST * now for before, now in zip(old, new, strict=True)]
+        self.rates = Rates(*mixed)
+        self.shares = trusted_shares(self.rates, self.config.trust)
+        figures: dict[str, float] = {}
+        for index, name in enumerate(self.spec.event_names):
+            figures[f"trust_{name}"] = float(self.shares[index])
+            figures[f"imagined_rate_{name}"] = float(new.imagined[index])
+            figures[f"real_rate_{name}"] = float(new.real[index])
+        return figures
+
+    # ---- what is kept ------------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything but the tally, which comes with every task."""
+        rates = {} if self.rates is None else {"imagined": self.rates.imagined, "real": self.rates.real}
+        return {"shares": self.shares, "rates": rates, "events": self.seen[0], "steps": self.seen[1]}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Replace the contents with `state()`."""
+        rates = {name: np.array(values, np.float64) for name, values in state["rates"].items()}
+        self.shares = np.array(state["shares"], np.float64)
+        self.rates = Rates(**rates) if rates else None
+        self.seen = (np.array(state["events"], np.int64), int(state["steps"]))

@@ -6,8 +6,8 @@ import time
 
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Loop, Pending, PlannedPhase, Progress, State, TrainedMember
-from popgen.methods.xpm_wm import member_progress as rules
-from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm import phase_rules as rules
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember

@@ -17,6 +17,6 @@ METHOD = Method(
     actors=list_actors,
     needs=estimate_needs,
     check=check_run,
-    policies={"world_model": "popgen.methods.xpm_wm.acting:WorldModelPolicy"},
+    policies={"world_model": "popgen.methods.xpm_wm.actor_critic:WorldModelPolicy"},
     continuation=Continuation("world_model", SHAPES, ("replay", "capacity")),
 )

@@ -10,12 +10,12 @@ from collections.abc import Generator
 from dataclasses import replace
 
 from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled
-from popgen.methods.xpm_wm import member_progress as rules
-from popgen.methods.xpm_wm import real_matches as real
+from popgen.methods.xpm_wm import phase_rules as rules
+from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.overlap import Overlap
-from popgen.methods.xpm_wm.play_tally import Tally
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.workers import (
     AgentTask,
     AgentUpdate,

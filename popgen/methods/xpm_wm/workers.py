@@ -9,9 +9,9 @@ from typing import Any, Protocol
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import MemberWeights
-from popgen.methods.xpm_wm.play_tally import Tally
-from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match
 

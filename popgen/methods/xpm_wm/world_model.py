@@ -1,33 +1,34 @@
 """The two-player world model of XPM-WM (paper, section 4.1): RSSM, joint encoder, per-player decoders, event head.
 
-    recurrent state   h_t = f(h_{t-1}, z_{t-1}, a^1_{t-1}, a^2_{t-1})
-    posterior         z_t ~ q(. | h_t, o^1_t, o^2_t)
     prior             z_t ~ p(. | h_t)
     decoder           o^i_t ~ p(. | h_t, z^i_t),  z^i = (z^joint, z^{p_i})
     events            r_t ~ Bernoulli(. | h_t, z_t), one per event and player
     continue          c_t ~ Bernoulli(. | h_t, z_t)
 
-`LatentFilter` is what acting needs (and what a predecessor leaves behind); `WorldModel` adds what imagining and
-learning need. Latents are class-major, see `popgen.methods.xpm_wm.latents`.
+`popgen.methods.xpm_wm.latent_filter` has recurrent state and posterior, which is what acting needs and a predecessor
+leaves behind; `WorldModel` adds what imagining and learning need.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec, ViewSpec
-from popgen.methods.xpm_wm import latents
 from popgen.methods.xpm_wm.config import WorldModelConfig
-from popgen.methods.xpm_wm.latents import Latent
-from popgen.methods.xpm_wm.world_model_losses import reconstruction
-from popgen.nets.blocks import ConvDecoder, ConvEncoder, NormGRUCell, mlp
-from popgen.shapes import check
+from popgen.methods.xpm_wm.latent_filter import (
+    Latent,
+    LatentFilter,
+    kl_divergence,
+    layer_style,
+    player_masks,
+    probabilities,
+)
+from popgen.nets.blocks import ConvDecoder, mlp
 
 
 @dataclass(frozen=True)
@@ -42,39 +43,6 @@ class Observed:
     prior: Tensor
 
 
-class JointEncoder(nn.Module):
-    """Both players' observations (B, P, *shape) -> embedding (B, units).
-
-    Grid views are centred first (`center`, see `WorldModel.set_outputs`): what never changes would fill the layers.
-    """
-
-    center: Tensor
-
-    def __init__(self, config: WorldModelConfig, view: ViewSpec) -> None:
-        super().__init__()
-        self.conv = None
-        inputs = 2 * view.shape[0]
-        if len(view.shape) == 3:
-            shape = (view.shape[0], view.shape[1], 2 * view.shape[2])
-            self.conv = ConvEncoder(
-                shape,
-                channels=config.cnn_channels,
-                kernels=config.cnn_kernels,
-                activation=config.activation,
-                norm=config.norm,
-            )
-            inputs = self.conv.features
-            self.register_buffer("center", torch.zeros(2, *view.shape))
-        self.trunk = mlp(inputs, None, **_layer_style(config), layers=config.encoder_layers)
-
-    def forward(self, obs: Tensor) -> Tensor:
-        """(B, P, *shape) -> (B, units)."""
-        if self.conv is None:
-            return self.trunk(obs.flatten(1))
-        obs = obs - self.center
-        return self.trunk(self.conv(torch.cat([obs[:, 0], obs[:, 1]], -1)))
-
-
 class PlayerDecoder(nn.Module):
     """One player's observation from (h, z^i): (B, D + C * G) -> logits or means (B, *shape).
 
@@ -84,7 +52,7 @@ class PlayerDecoder(nn.Module):
     def __init__(self, config: WorldModelConfig, view: ViewSpec, inputs: int) -> None:
         super().__init__()
         flat = len(view.shape) == 1
-        self.trunk = mlp(inputs, view.shape[0] if flat else None, **_layer_style(config), layers=config.decoder_layers)
+        self.trunk = mlp(inputs, view.shape[0] if flat else None, **layer_style(config), layers=config.decoder_layers)
         self.conv = None
         if not flat:
             self.conv = ConvDecoder(
@@ -113,128 +81,6 @@ class PlayerDecoder(nn.Module):
         return hidden if self.conv is None else self.conv(hidden)
 
 
-class LatentFilter(nn.Module):
-    """Encoder, recurrent state model and posterior: what tracks the latent state of a running episode."""
-
-    maxima: Tensor | None
-
-    def __init__(self, config: WorldModelConfig, spec: EnvSpec) -> None:
-        super().__init__()
-        self.config = config
-        self.view: ViewSpec = spec.views[config.view]
-        maxima = None if self.view.maxima is None else torch.tensor(self.view.maxima)
-        self.register_buffer("maxima", maxima, persistent=False)
-        self.num_actions = spec.num_actions
-        self.latent_size = config.classes * config.groups
-        self.encoder = JointEncoder(config, self.view)
-        step_inputs = self.latent_size + 2 * self.num_actions
-        self.step_net = None
-        if config.recurrent_units:
-            style: dict[str, Any] = {**_layer_style(config), "units": config.recurrent_units}
-            self.step_net = mlp(step_inputs + config.deter, None, **style, layers=1)
-            step_inputs = config.recurrent_units
-        self.gru = NormGRUCell(step_inputs, config.deter)
-        inputs = config.deter + config.units
-        self.posterior_net = mlp(inputs, self.latent_size, **_layer_style(config), layers=config.posterior_layers)
-
-    def initial(self, batch: int) -> Latent:
-        """The state before the first observation: zeros."""
-        device, dtype = self.gru.gates.weight.device, self.gru.gates.weight.dtype
-        return Latent(
-            torch.zeros(batch, self.config.deter, device=device, dtype=dtype),
-            torch.zeros(batch, self.latent_size, device=device, dtype=dtype),
-        )
-
-    def transition(self, latent: Latent, actions: Int[Tensor, "B P"]) -> Float[Tensor, "B D"]:
-        """h_t from the state and joint actions (B, P) int64 of step t - 1; actions < 0 count as none."""
-        classes = torch.arange(self.num_actions, device=actions.device)
-        one_hot = (actions.unsqueeze(-1) == classes).flatten(1).to(latent.h.dtype)
-        inputs = torch.cat([latent.z, one_hot], -1)
-        if self.step_net is not None:
-            inputs = self.step_net(torch.cat([inputs, latent.h], -1))
-        return self.gru(inputs, latent.h)
-
-    def posterior(
-        self, h: Float[Tensor, "*batch D"], embedding: Float[Tensor, "*batch U"]
-    ) -> Float[Tensor, "*batch C G"]:
-        """q(z | h, o) as probabilities (..., C, G)."""
-        logits = self.posterior_net(torch.cat([h, embedding], -1))
-        return latents.probabilities(self.grouped(logits), self.config.unimix)
-
-    def grouped(self, flat: Float[Tensor, "*batch CG"]) -> Float[Tensor, "*batch C G"]:
-        """(..., C * G) -> (..., C, G)."""
-        return flat.unflatten(-1, (self.config.classes, self.config.groups))
-
-    def scaled(self, obs: Tensor) -> Tensor:
-        """Observations as floats in the range that networks see and decoders predict."""
-        obs = obs.to(self.gru.gates.weight.dtype)
-        if self.maxima is not None:
-            return obs / self.maxima
-        return obs if self.view.scale == 1.0 else obs / self.view.scale
-
-    def before(
-        self, latent: Latent, actions: Int[Tensor, "B P"], is_first: Bool[Tensor, " B"]
-    ) -> tuple[Latent, Int[Tensor, "B P"]]:
-        """State and actions of the previous step, blanked where an episode (or window) begins."""
-        keep = (~is_first).to(latent.h.dtype).unsqueeze(-1)
-        blanked = torch.where(is_first.unsqueeze(-1), torch.full_like(actions, -1), actions)
-        return Latent(latent.h * keep, latent.z * keep), blanked
-
-    @torch.no_grad()
-    def filter(
-        self,
-        latent: Latent,
-        obs: Shaped[Tensor, "B P *shape"],
-        actions: Int[Tensor, "B P"],
-        is_first: Bool[Tensor, " B"],
-        generator: torch.Generator | None = None,
-    ) -> Latent:
-        """One step of acting: the state after seeing obs (B, P, *shape), actions (B, P) having led to it."""
-        h = self.transition(*self.before(latent, actions, is_first))
-        probs = self.posterior(h, self.encoder(self.scaled(obs)))
-        return Latent(h, self.drawn(probs, generator))
-
-    def drawn(
-        self, probs: Float[Tensor, "*batch C G"], generator: torch.Generator | None = None
-    ) -> Float[Tensor, "*batch CG"]:
-        """Latents for acting and imagining, (..., C, G) -> (..., C * G).
-
-        `imagination=mode` takes the most likely class: where the task itself is deterministic, a sampled latent
-        only adds errors, and a policy learns to farm the rare ones that pay. `sample` is the paper's.
-        """
-        if self.config.imagination == "mode":
-            return latents.mode_one_hot(probs).to(probs.dtype).flatten(-2)
-        return latents.sample_one_hot(probs, generator).flatten(-2)
-
-    def observe_posterior(
-        self,
-        obs: Float[Tensor, "T B P *shape"],
-        actions: Int[Tensor, "T B P"],
-        is_first: Bool[Tensor, "T B"],
-        generator: torch.Generator | None = None,
-    ) -> tuple[Latent, Float[Tensor, "T B C G"]]:
-        """Filter a window, time first, with gradients: states (T, B, .) and posteriors (T, B, C, G).
-
-        Args:
-            obs: (T, B, P, *shape) scaled floats.
-            actions: (T, B, P) int64, the joint action *before* each step.
-            is_first: (T, B) bool.
-        """
-        steps, batch = is_first.shape
-        check(actions, (steps, batch, 2), "actions")
-        embedding = self.encoder(obs.flatten(0, 1)).unflatten(0, (steps, batch))
-        state = self.initial(batch)
-        hs, zs, posteriors = [], [], []
-        for t in range(steps):
-            h = self.transition(*self.before(state, actions[t], is_first[t]))
-            posterior = self.posterior(h, embedding[t])
-            state = Latent(h, latents.straight_through(posterior, generator).flatten(-2))
-            hs.append(h)
-            zs.append(state.z)
-            posteriors.append(posterior)
-        return Latent(torch.stack(hs), torch.stack(zs)), torch.stack(posteriors)
-
-
 class WorldModel(nn.Module):
     """The filter with prior, decoders and heads.
 
@@ -251,13 +97,13 @@ class WorldModel(nn.Module):
         self.filter = LatentFilter(config, spec)
         size = self.filter.latent_size
         inputs = config.deter + size
-        style = _layer_style(config)
+        style = layer_style(config)
         self.prior_net = mlp(config.deter, size, **style, layers=config.prior_layers)
         self.decoders = nn.ModuleList(PlayerDecoder(config, self.filter.view, inputs) for _ in range(2))
         outputs = spec.num_events * spec.num_players
         self.event_head = mlp(inputs, outputs, **style, layers=config.head_layers)
         self.continue_head = mlp(inputs, 1, **style, layers=config.head_layers)
-        masks = latents.player_masks(config.groups, config.joint_groups, config.classes)
+        masks = player_masks(config.groups, config.joint_groups, config.classes)
         self.register_buffer("masks", masks, persistent=False)
         weights = torch.tensor(spec.event_weights).repeat(spec.num_players)
         self.register_buffer("event_weights", weights, persistent=False)
@@ -265,7 +111,7 @@ class WorldModel(nn.Module):
 
     def prior(self, h: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch C G"]:
         """p(z | h) as probabilities (..., C, G)."""
-        return latents.probabilities(self.filter.grouped(self.prior_net(h)), self.config.unimix)
+        return probabilities(self.filter.grouped(self.prior_net(h)), self.config.unimix)
 
     def observe(
         self,
@@ -303,7 +149,7 @@ class WorldModel(nn.Module):
 
         Bernoulli where all is 0 or 1; the same of n / N for counts n of at most N; else Gaussian.
         """
-        return reconstruction(decoded, obs, binary=self.logits, largest=self.filter.maxima)
+        return reconstruction_loss(decoded, obs, binary=self.logits, largest=self.filter.maxima)
 
     def event_logits(self, latent: Latent) -> Float[Tensor, "*batch PE"]:
         """(..., P * E), player-major."""
@@ -361,5 +207,75 @@ def _last_bias(net: nn.Sequential) -> nn.Parameter:
     return last.bias
 
 
-def _layer_style(config: WorldModelConfig) -> dict[str, Any]:
-    return {"units": config.units, "activation": config.activation, "norm": config.norm}
+# ---- terms of the loss (paper, equations WM and WM+) -----------------------------------------------------------------
+
+
+def masked_mean(values: Float[Tensor, "T B"], mask: Float[Tensor, "T B"]) -> Float[Tensor, ""]:
+    """Mean of values (T, B) where mask (T, B) is 1; 0 if nowhere."""
+    return (values * mask).sum() / mask.sum().clamp(min=1.0)
+
+
+def reconstruction_loss(
+    outputs: Float[Tensor, "T B *shape"],
+    target: Float[Tensor, "T B *shape"],
+    *,
+    binary: bool,
+    largest: Tensor | None = None,
+) -> Float[Tensor, "T B"]:
+    """-ln p(o | h, z), up to a constant. (T, B, ...) -> (T, B).
+
+    Args:
+        outputs: logits of Bernoulli variables and counts if `binary`, else means of Gaussians of variance 1.
+        target: for counts, their share of the largest count, whose logit is then the output.
+        largest: largest counts (1 for a Bernoulli variable), broadcast to the outputs; None if all are 1. A count
+            weighs as its root: as a Binomial one of n trials it would weigh n, and drown the variables beside it.
+    """
+    if binary:
+        loss = F.binary_cross_entropy_with_logits(outputs, target, reduction="none")
+        loss = loss if largest is None else largest.sqrt() * loss
+    else:
+        loss = 0.5 * (outputs - target).square()
+    return loss.flatten(2).sum(-1)
+
+
+def event_loss(logits: Float[Tensor, "T B PE"], target: Float[Tensor, "T B PE"]) -> Float[Tensor, "T B"]:
+    """-ln p(r | h, z) of the binary event vector. (T, B, P * E) -> (T, B)."""
+    return F.binary_cross_entropy_with_logits(logits, target, reduction="none").sum(-1)
+
+
+def balanced_kl(
+    posterior: Float[Tensor, "T B C G"], prior: Float[Tensor, "T B C G"], *, dyn: float, rep: float, free_nats: float
+) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B"]]:
+    """KL balancing with free nats (DreamerV2/V3).
+
+        dyn * max(free, KL[sg(q) || p]) + rep * max(free, KL[q || sg(p)])
+
+    Args:
+        posterior, prior: probabilities (T, B, C, G).
+
+    Returns:
+        The weighted loss (T, B) and the raw KL (T, B) for logging.
+    """
+    dynamics = kl_divergence(posterior.detach(), prior)
+    representation = kl_divergence(posterior, prior.detach())
+    loss = dyn * dynamics.clamp(min=free_nats) + rep * representation.clamp(min=free_nats)
+    return loss, dynamics.detach()
+
+
+def predecessor_kl(posterior: Float[Tensor, "T B C G"], predecessor: Float[Tensor, "T B C G"]) -> Float[Tensor, "T B"]:
+    """KL[q_j(z | h, o) || q_k(z | h, o)] on cross-play data with k (paper, eq. WM+). (T, B, C, G) -> (T, B)."""
+    return kl_divergence(posterior, predecessor.detach())
+
+
+def event_counts(
+    logits: Float[Tensor, "T B P E"], target: Float[Tensor, "T B P E"], mask: Float[Tensor, "T B"]
+) -> dict[str, Tensor]:
+    """True positives, predicted and actual positives per event at threshold 1/2, over the masked steps.
+
+    logits, target (T, B, P, E); mask (T, B). Each result (E,). Precision = hits / predicted, recall = hits / actual.
+    """
+    chosen = mask.bool()
+    predicted, actual = (logits > 0.0)[chosen].float(), target[chosen]
+    total = {"hits": predicted * actual, "predicted": predicted, "actual": actual}
+    none = torch.zeros(target.shape[-1], device=target.device)
+    return {name: value.sum(dim=(0, 1)) if value.numel() else none for name, value in total.items()}

@@ -10,12 +10,20 @@ import torch
 from torch import Tensor
 
 from popgen.envs.contract import EnvSpec
-from popgen.methods.xpm_wm import world_model_losses as losses
 from popgen.methods.xpm_wm.config import WorldModelConfig
-from popgen.methods.xpm_wm.latents import to_indices
+from popgen.methods.xpm_wm.imagination import Starts
+from popgen.methods.xpm_wm.latent_filter import to_indices
 from popgen.methods.xpm_wm.replay import KIND_CODE, Windows
-from popgen.methods.xpm_wm.start_states import Starts
-from popgen.methods.xpm_wm.world_model import LatentFilter, Observed, WorldModel, bernoulli_loss
+from popgen.methods.xpm_wm.world_model import (
+    LatentFilter,
+    Observed,
+    WorldModel,
+    balanced_kl,
+    bernoulli_loss,
+    event_loss,
+    masked_mean,
+    predecessor_kl,
+)
 from popgen.nets import weights as w
 from popgen.types import Kind
 
@@ -102,18 +110,18 @@ class ModelLearner:
         inner = (~batch.is_first).float()
         decoded = model.decode(seen.latent)
         events = model.event_logits(seen.latent)
-        kl_loss, kl = losses.balanced_kl(
+        kl_loss, kl = balanced_kl(
             seen.posterior, seen.prior, dyn=config.kl_dyn, rep=config.kl_rep, free_nats=config.free_nats
         )
         going_on = bernoulli_loss(model.continue_head(seen.latent.flat()).squeeze(-1), 1.0 - batch.terminal)
         terms = {
             "observation": model.observation_loss(decoded, batch.obs).mean(),
-            "events": losses.masked_mean(losses.events(events, batch.events.flatten(2)), inner),
+            "events": masked_mean(event_loss(events, batch.events.flatten(2)), inner),
             "continue": going_on.mean(),
-            "kl": losses.masked_mean(kl_loss, inner),
+            "kl": masked_mean(kl_loss, inner),
             "predecessors": self._predecessor_loss(batch, seen),
         }
-        extras = {"kl": losses.masked_mean(kl, inner), "exact": model.exact(decoded.detach(), batch.obs).float().mean()}
+        extras = {"kl": masked_mean(kl, inner), "exact": model.exact(decoded.detach(), batch.obs).float().mean()}
         return ModelLosses(terms, seen, extras)
 
     def _predecessor_loss(self, batch: WindowBatch, seen: Observed) -> Tensor:
@@ -133,7 +141,7 @@ class ModelLearner:
                     batch.obs[:, rows], batch.actions[:, rows], batch.is_first[:, rows], self.generator
                 )
             share = rows.float().mean()
-            total = total + share * losses.predecessor_kl(seen.posterior[:, rows], theirs).mean()
+            total = total + share * predecessor_kl(seen.posterior[:, rows], theirs).mean()
         return total
 
     def loss_weights(self) -> dict[str, float]:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from support.small import AGENT, MODEL, kitchen, random_play
 
-from popgen.methods.xpm_wm.acting import WorldModelPolicy
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import ACTING
 from popgen.nets import weights as w
 from popgen.policies.policy_registry import build_policy

@@ -5,7 +5,7 @@ import torch
 from support.small import AGENT, MODEL, PRIVATE, random_latent, with_other_group
 
 from popgen.methods.xpm_wm.actor_critic import Actor, Critic
-from popgen.methods.xpm_wm.latents import Latent
+from popgen.methods.xpm_wm.latent_filter import Latent
 
 ACTIONS = 6
 CONFIG = AGENT.model_copy(update={"unimix": 0.06})

@@ -12,11 +12,9 @@ from torch import Tensor
 from popgen.losses.policy_losses import lambda_return
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner, rollout_dtype
-from popgen.methods.xpm_wm.agent_networks import SELF
-from popgen.methods.xpm_wm.agent_targets import sample_losses
-from popgen.methods.xpm_wm.imagination import Imagined
-from popgen.methods.xpm_wm.latents import Latent
-from popgen.methods.xpm_wm.start_states import NEW_SP, NEW_XP, OLD, Starts
+from popgen.methods.xpm_wm.agent_update import SELF, sample_losses
+from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Imagined, Starts
+from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.nets import weights as w
 from popgen.runs.state_files import load_state, save_state
 

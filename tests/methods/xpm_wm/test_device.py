@@ -16,8 +16,8 @@ from popgen.errors import UserError
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import OPEN_LOOP
+from popgen.methods.xpm_wm.imagination import NEW_XP, OLD, Starts
 from popgen.methods.xpm_wm.model_report import model_report
-from popgen.methods.xpm_wm.start_states import NEW_XP, OLD, Starts
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
 from popgen.nets import weights as w
 

@@ -10,12 +10,18 @@ import pytest
 import torch
 from support.small import AGENT, MODEL, kitchen, random_latent, random_play, random_windows
 
-from popgen.methods.xpm_wm.agent_schedules import entropy_scale
-from popgen.methods.xpm_wm.agent_targets import clip_advantages
+from popgen.methods.xpm_wm.agent import entropy_scale
+from popgen.methods.xpm_wm.agent_update import clip_advantages
 from popgen.methods.xpm_wm.config import DiscoveryConfig
-from popgen.methods.xpm_wm.discovery import LEAST_TRUST, Discovery, Rates, dearest_events, trusted_shares
-from popgen.methods.xpm_wm.imagination import expected_pay
-from popgen.methods.xpm_wm.play_tally import Tally, TallyKeeper
+from popgen.methods.xpm_wm.imagination import (
+    LEAST_TRUST,
+    Discovery,
+    Rates,
+    dearest_events,
+    expected_pay,
+    trusted_shares,
+)
+from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner, before_or_at
 
@@ -110,7 +116,7 @@ def test_the_bonus_is_that_of_the_states_that_the_model_shows() -> None:
 
 
 def _make_parts() -> tuple[Any, Any]:
-    from popgen.methods.xpm_wm.play_tally import part_weights
+    from popgen.methods.xpm_wm.real_play import part_weights
 
     view = SPEC.views["features"]
     return view.own, part_weights(view)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from popgen.methods.xpm_wm.imagination import imagine
-from popgen.methods.xpm_wm.latents import Latent
+from popgen.methods.xpm_wm.latent_filter import Latent
 
 
 class Counter:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from support.small import random_probs
 
-from popgen.methods.xpm_wm import latents
+from popgen.methods.xpm_wm import latent_filter as latents
 
 
 def test_probabilities_run_over_the_classes_and_keep_a_uniform_share() -> None:

@@ -9,11 +9,11 @@ import pytest
 
 from popgen.actors.checkpoint_writer import resolve_handles
 from popgen.methods.transport import InlineTransport, Ready
-from popgen.methods.xpm_wm import member_progress as rules
+from popgen.methods.xpm_wm import phase_rules as rules
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
+from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
-from popgen.methods.xpm_wm.play_tally import Tally
-from popgen.methods.xpm_wm.start_states import Starts
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerStrength
 from popgen.types import Kind

@@ -11,9 +11,8 @@ from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.methods.xpm_wm.agent import AgentLearner
-from popgen.methods.xpm_wm.replay import Query
-from popgen.methods.xpm_wm.start_states import NEW_SP, NEW_XP, OLD, Starts, draw_cross_play, draw_self_play
-from popgen.methods.xpm_wm.windows import model_batch, start_batch
+from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Starts, draw_cross_play, draw_self_play
+from popgen.methods.xpm_wm.replay import Query, model_batch, start_batch
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.types import Kind
 

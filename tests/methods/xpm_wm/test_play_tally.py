@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from support.small import kitchen, random_play
 
-from popgen.methods.xpm_wm.play_tally import Tally, TallyKeeper, part_weights
+from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper, part_weights
 from popgen.runs.state_files import load_state, save_state
 
 VIEW = kitchen().spec.views["features"]

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from popgen.methods.xpm_wm.replay import KIND_CODE, Query, Replay
-from popgen.methods.xpm_wm.window_requests import Request, draw, join
+from popgen.methods.xpm_wm.replay import KIND_CODE, Query, Replay, Request, draw, join
 from popgen.types import RANDOM_MEMBER, Kind, Segment
 
 EVENTS = 3

@@ -7,7 +7,7 @@ from support.small import MODEL, PRIVATE, kitchen, random_latent, random_windows
 from torch import Tensor
 
 from popgen.methods.xpm_wm.config import WorldModelConfig
-from popgen.methods.xpm_wm.latents import Latent
+from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.world_model import WorldModel
 
 SPEC = kitchen().spec

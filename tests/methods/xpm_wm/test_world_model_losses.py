@@ -6,8 +6,8 @@ import pytest
 import torch
 from support.small import random_probs
 
-from popgen.methods.xpm_wm import world_model_losses as losses
-from popgen.methods.xpm_wm.latents import kl_divergence
+from popgen.methods.xpm_wm import world_model as losses
+from popgen.methods.xpm_wm.latent_filter import kl_divergence
 
 
 def test_masked_mean() -> None:
@@ -19,17 +19,17 @@ def test_masked_mean() -> None:
 def test_bernoulli_reconstruction_by_hand() -> None:
     # Probabilities 0.75 and 0.5 of two pixels, targets 1 and 0, of one player at one time.
     logits, target = torch.tensor([math.log(3.0), 0.0]), torch.tensor([1.0, 0.0])
-    loss = losses.reconstruction(logits.reshape(1, 1, 2), target.reshape(1, 1, 2), binary=True)
+    loss = losses.reconstruction_loss(logits.reshape(1, 1, 2), target.reshape(1, 1, 2), binary=True)
     assert loss.shape == (1, 1) and float(loss) == pytest.approx(-math.log(0.75) - math.log(0.5))
 
 
 def test_counts_weigh_as_the_root_of_the_largest() -> None:
     # One plane of 0 and 1, one of counts up to 16; shares 1 and 4 / 16, probabilities 0.75 and 0.5.
     outputs, target = torch.tensor([math.log(3.0), 0.0]).reshape(1, 1, 2), torch.tensor([1.0, 0.25]).reshape(1, 1, 2)
-    loss = losses.reconstruction(outputs, target, binary=True, largest=torch.tensor([1.0, 16.0]))
+    loss = losses.reconstruction_loss(outputs, target, binary=True, largest=torch.tensor([1.0, 16.0]))
     assert float(loss) == pytest.approx(-math.log(0.75) - 4 * math.log(0.5))
     outputs.requires_grad_()
-    losses.reconstruction(outputs, target, binary=True, largest=torch.tensor([1.0, 16.0])).sum().backward()
+    losses.reconstruction_loss(outputs, target, binary=True, largest=torch.tensor([1.0, 16.0])).sum().backward()
     torch.testing.assert_close(outputs.grad.flatten(), torch.tensor([0.75 - 1.0, 4 * (0.5 - 0.25)]))
 
 
@@ -38,12 +38,12 @@ def test_gaussian_reconstruction_sums_over_players_and_pixels() -> None:
     target[1, 2, 0, 1, 1], target[1, 2, 1, 3, 4] = 2.0, 1.0
     expected = torch.zeros(2, 3)
     expected[1, 2] = 0.5 * (4.0 + 1.0)
-    torch.testing.assert_close(losses.reconstruction(means, target, binary=False), expected)
+    torch.testing.assert_close(losses.reconstruction_loss(means, target, binary=False), expected)
 
 
 def test_event_loss_sums_over_events() -> None:
     logits = torch.tensor([[[0.0, math.log(9.0)]]])
-    loss = losses.events(logits, torch.tensor([[[1.0, 1.0]]]))
+    loss = losses.event_loss(logits, torch.tensor([[[1.0, 1.0]]]))
     assert float(loss) == pytest.approx(-math.log(0.5) - math.log(0.9))
 
 
