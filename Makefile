@@ -14,7 +14,7 @@ help:  ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 demo: install  ## a population of two in the cramped room, with its SP/XP matrix
-	$(BIN)/popgen run env=overcooked/cramped_room scale=demo seed=1
+	$(BIN)/popgen run env=overcooked/cramped_room scale=demo seed=1 run.id=demo
 
 test: install  ## all tests
 	$(PYTEST)

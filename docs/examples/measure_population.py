@@ -1,6 +1,6 @@
 """Measure a population: the SP/XP matrix as a pandas frame, and who plays how beside a random partner.
 
-python docs/examples/measure_population.py runs/RUN_ID
+python docs/examples/measure_population.py runs/demo
 """
 
 import sys

@@ -1,6 +1,6 @@
 """A PettingZoo environment in which a member of a population plays one seat and an agent of yours the other.
 
-    python docs/examples/partner_for_an_agent.py runs/RUN_ID
+    python docs/examples/partner_for_an_agent.py runs/demo
 
 The observations are float32, which the default networks of RLlib and Stable-Baselines3 take. Replace `choose_action` by
 your own agent; with a member drawn anew for every episode it has to adapt to partners.

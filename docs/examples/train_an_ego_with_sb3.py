@@ -1,6 +1,6 @@
 """An ego trained beside a population by Stable-Baselines3 (pip install stable-baselines3).
 
-    python docs/examples/train_an_ego_with_sb3.py runs/RUN_ID 2000
+    python docs/examples/train_an_ego_with_sb3.py runs/demo 2000
 
 The last word is how many steps; a million is enough to see it learn. `--out FILE` keeps it.
 """

@@ -29,7 +29,7 @@ def test_every_script_is_here() -> None:
 def test_scripts_run_as_their_first_lines_say(name: str, random_population: Path) -> None:
     text = (EXAMPLES / name).read_text()
     command = next(line.split() for line in text.splitlines() if line.strip().startswith("python docs/"))
-    words = [str(random_population) if word == "runs/RUN_ID" else word for word in command[1:]]
+    words = [str(random_population) if word == "runs/demo" else word for word in command[1:]]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
