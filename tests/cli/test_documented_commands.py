@@ -64,6 +64,7 @@ ELSEWHERE = {
     "/shared/": "{folder}/",
     "humans/cramped_room_A": "runs/again",  # not fitted here
     ":1,2,3": ":1,2",
+    "seed=1,2,3": "seed=1,2",
 }
 IN_PYTHON = {
     "runs/partners:3": "runs/partners:2",
