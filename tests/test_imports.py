@@ -21,6 +21,7 @@ ORDER = (
     "runs",
     "reports",
     "pages",
+    "study",
     "actors",
     "pipelines",
     *("conf", "cli", "__main__"),
