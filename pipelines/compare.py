@@ -15,7 +15,7 @@ from popgen.progress import Reporter
 from popgen.reports.comparison import Group, costs, group_runs, quality_costs
 from popgen.reports.comparison_report import Comparison, chosen_thresholds, to_dict, write_report
 from popgen.reports.run_record import REAL, RunRecord, planned_run, read_run
-from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker
+from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker, address_in_mlflow
 
 EXPERIMENT = "popgen-compare"
 """Name of the MLflow experiment that comparisons go to."""
@@ -49,7 +49,8 @@ def compare_runs(
         reporter: told of progress.
 
     Returns:
-        The object of `popgen.reports.comparison_report` and `files` (paths by name).
+        The object of `popgen.reports.comparison_report`, `files` (paths by name) and `tracking` (command and address
+        that show it in MLflow, None without).
 
     Raises:
         UserError: a run that is unfinished or cannot be compared with the others, or one that fails.
@@ -65,8 +66,8 @@ def compare_runs(
     held = hold_runs(groups, list(thresholds), episodes, reporter)
     comparison = Comparison(tuple(groups), agents, thresholds, held)
     files = write_report(comparison, out)
-    log_comparison(comparison, files, Path(out), tracking)
-    return to_dict(comparison) | {"files": {name: str(path) for name, path in files.items()}}
+    tracked = log_comparison(comparison, files, Path(out), tracking)
+    return to_dict(comparison) | {"files": {name: str(path) for name, path in files.items()}, "tracking": tracked}
 
 
 def hold_runs(
@@ -83,8 +84,14 @@ def hold_runs(
     return found
 
 
-def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path, tracking: TrackingConfig) -> None:
-    """One MLflow run for the comparison, with its tables and pictures, and a nested one for each run compared."""
+def log_comparison(
+    comparison: Comparison, files: Mapping[str, Path], out: Path, tracking: TrackingConfig
+) -> dict[str, str] | None:
+    """One MLflow run for the comparison, with its tables and pictures, and a nested one for each run compared.
+
+    Returns:
+        The command and the address that show it; None with tracking disabled.
+    """
     told = {"agents": comparison.agents or 0, "runs": len(_list_runs(comparison))}
     whole = Tracker(tracking, out, "comparison", told)
     for group in comparison.groups:
@@ -106,6 +113,7 @@ def log_comparison(comparison: Comparison, files: Mapping[str, Path], out: Path,
         shown = "\n".join(f"![{Path(name).stem}](artefact:comparison/{name})" for name in pictures)
         whole.describe(f"{shown}\n\n{files['comparison.md'].read_text(encoding='utf-8')}")
     whole.finish()
+    return address_in_mlflow(tracking, whole.state(), out) if tracking.enabled else None
 
 
 def drop_constant_zeros(points: Mapping[int, Mapping[str, float]]) -> dict[int, dict[str, float]]:

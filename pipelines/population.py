@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 import time
@@ -34,13 +35,14 @@ from popgen.reports.crossplay_report import list_warnings, to_dict, write_report
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_description import describe_experiment, describe_run
 from popgen.reports.run_figures import write_run_figures
+from popgen.runs.chart_trackers import FOLDER, OFFLINE, TensorboardTracker, WandbTracker
 from popgen.runs.directory import RunState, named, run_folder
-from popgen.runs.mlflow_tracker import STORE, LocalTracker, choose_store, view_address
+from popgen.runs.mlflow_tracker import LocalTracker, address_in_mlflow, choose_store
 from popgen.runs.monitoring import LoggingReporter, gauge
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import RetryBudget, actor_failure, first_line, nodes_alive, user_facing_error, wait_for_room
+from popgen.runs.sinks import NoTracker, TrackerClient
 from popgen.runs.storage import Mirror
-from popgen.runs.tracking_address import sqlite_uri
 from popgen.types import FINAL_SKILL
 
 HALT_SECONDS = 30.0
@@ -61,8 +63,8 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
 
     Returns:
         run_id, run_dir, population (path), members (count), ledger (steps by member and kind), matrix and evaluation
-        (`popgen.reports.crossplay_report`), warnings (what of it speaks against low cross-play, in sentences), mlflow
-        (command and address that show the run, None without tracking), findings (text and good: what the figures
+        (`popgen.reports.crossplay_report`), warnings (what of it speaks against low cross-play, in sentences), tracking
+        (writer, command and address that show the run; None with tracking=off), findings (text and good: what the figures
         mean), files (paths by name or suffix), seconds.
 
     Raises:
@@ -76,11 +78,7 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
         RunState.check_free(run_folder(config))  # the copy would be put in place of what its driver writes to
         if restored := Mirror(run_folder(config), config.run.storage).pull():
             reporter.note(restored)
-    tracker_kind = RemoteTracker if config.run.transport == "ray" else LocalTracker
-    folder = run_folder(config)
-    store = choose_store(folder, config.run.storage)
-    tracker = tracker_kind(config.tracking, folder, str(config.run.id), config.as_dict(), store=store)
-    recorder = RunRecorder(config, spec, tracker)
+    recorder = RunRecorder(config, spec, make_tracker(config))
     reporter.note(f"run {recorder.run_id} in {recorder.dir}")
     job = PopulationJob(config, spec, recorder, reporter)
     status = "FAILED"
@@ -102,6 +100,19 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
             job.recorder.close(status, None if status == "FINISHED" else sys.exception())
         finally:
             job.end()
+
+
+def make_tracker(config: RunConfig) -> TrackerClient:
+    """What `tracking` asks for, not yet started: MLflow's in an actor of its own where the run has Ray."""
+    folder, name = run_folder(config), str(config.run.id)
+    if not config.tracking.enabled:
+        return NoTracker()
+    if config.tracking.writer == "tensorboard":
+        return TensorboardTracker(folder)
+    if config.tracking.writer == "wandb":
+        return WandbTracker(config.tracking, folder, name, config.as_dict())
+    kind = RemoteTracker if config.run.transport == "ray" else LocalTracker
+    return kind(config.tracking, folder, name, config.as_dict(), store=choose_store(folder, config.run.storage))
 
 
 class PopulationJob:
@@ -234,7 +245,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         "ledger": recorder.ledger.table(),
         "matrix": evaluation["matrix"],
         "evaluation": evaluation,
-        "mlflow": _find_mlflow(config, recorder),
+        "tracking": find_tracked(config, recorder),
         "warnings": list_warnings(evaluation),
         "weak_members": weak,
         "findings": [finding.as_dict() for finding in list_findings(source)],
@@ -253,13 +264,19 @@ def list_weak_members(config: RunConfig, recorder: RunRecorder, result: CrossPla
     return [one for one in found if one.member not in meant]
 
 
-def _find_mlflow(config: RunConfig, recorder: RunRecorder) -> dict[str, str] | None:
-    """How to look at the run in MLflow."""
+def find_tracked(config: RunConfig, recorder: RunRecorder) -> dict[str, str] | None:
+    """Where to look at the run: writer, command and address, an empty one where there is none to give."""
     tracking = config.tracking
     if not tracking.enabled:
         return None
+    if tracking.writer == "tensorboard":
+        command = f"tensorboard --logdir {shlex.quote(str(recorder.dir / FOLDER))}"
+        return {"writer": tracking.writer, "command": command, "address": ""}
     state = recorder.tracker.flush()
-    if tracking.uri is not None and tracking.uri.startswith("http"):
-        return {"command": "", "address": view_address(state, tracking.uri.rstrip("/"))}
-    uri = tracking.uri or sqlite_uri(choose_store(recorder.dir, config.run.storage) / STORE)
-    return {"command": f"mlflow ui --backend-store-uri {shlex.quote(uri)}", "address": view_address(state)}
+    if tracking.writer == "wandb":
+        here = f"wandb sync {shlex.quote(str(recorder.dir / 'wandb'))}/offline-run-*"
+        offline = os.environ.get("WANDB_MODE") in OFFLINE
+        address = "" if offline else f"the run {recorder.run_id} of the project {tracking.experiment}"
+        return {"writer": tracking.writer, "command": here if offline else "", "address": address}
+    store = choose_store(recorder.dir, config.run.storage)
+    return {"writer": tracking.writer, **address_in_mlflow(tracking, state, store)}

@@ -19,7 +19,7 @@ def add(commands: Any) -> None:
         compare,
         "environment steps, time, SP/XP and steps to equal quality of finished runs, against the number of agents",
         "Runs of one method and environment are its seeds. Keys of --json: those of "
-        "popgen/reports/comparison_report (runs, costs, scores, quality, budgets, notes) and files.",
+        "popgen/reports/comparison_report (runs, costs, scores, quality, budgets, notes), files and tracking (command, address).",
     )
     parser.add_argument(
         "runs", nargs="*", type=named_path, metavar="[NAME=]RUN", help="a run's folder, called NAME and not its method"
@@ -74,4 +74,6 @@ def compare(args: argparse.Namespace) -> int:
         print_json(report)
         return OK
     print_report([sheet.to_rich() for sheet in to_sheets(report)], report["notes"], args.out, report["files"])
+    if shown := report["tracking"]:
+        print("mlflow: " + "\n        ".join(line for line in (shown["command"], shown["address"]) if line))
     return OK

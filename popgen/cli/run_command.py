@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
         "the last lines name (evaluation.weak_share), 130 when interrupted. Keys of --json: run_id, run_dir, "
         "population (paths), members (how many), matrix (mean and standard_error, row = seat 0, column = seat 1), "
         "ledger (environment steps by member and kind), evaluation (as `evaluate --json`), weak_members (a line for "
-        "each that does not play), files (the report's), seconds; with --dry-run the whole configuration.",
+        "each that does not play), files (the report's), tracking (writer, command, address), seconds; with --dry-run the whole configuration.",
     )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
     parser.add_argument(
@@ -156,8 +156,9 @@ def _print_run(result: Mapping[str, Any]) -> None:
     if "report" in files:
         print(f"\npage:     {files['report']} (open it in a browser)")
         print(f"pictures: {', '.join(sorted(name for name in map(_name_file, files.values()) if '.png' in name))}")
-    if shown := result.get("mlflow"):
-        print(f"mlflow:   {shown['command']}\n          {shown['address']}")
+    if shown := result.get("tracking"):
+        told = [line for line in (shown["command"], shown["address"]) if line]
+        print(f"{shown['writer'] + ':':<9} " + "\n          ".join(told))
     print("\nnext")
     for command, what in next_commands(result["run_dir"], result["members"]):
         print(f"  {command}\n      {what}")

@@ -85,16 +85,24 @@ class ClusterConfig(Schema):
 
 
 class TrackingConfig(Schema):
-    """MLflow."""
+    """Where curves and figures go beside the run's folder."""
 
     enabled: StrictBool = True
-    """Whether MLflow follows the run."""
+    """Whether anything follows the run."""
+    writer: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
+    """What follows it: MLflow, TensorBoard's event files in the run's folder, or Weights & Biases."""
     uri: str | None = None
     """MLflow's tracking URI; null: a sqlite store in `run.root`, of all runs there."""
     experiment: str = "popgen"
-    """Name of the MLflow experiment."""
+    """Name of MLflow's experiment, or of the project of Weights & Biases."""
     system_metrics: StrictBool = False
-    """Log processor, memory, disk and network of the tracker's machine every 10 s."""
+    """Log processor, memory, disk and network of the tracker's machine to MLflow every 10 s."""
+
+    @model_validator(mode="after")
+    def _address_is_mlflows(self) -> TrackingConfig:
+        if self.enabled and self.writer != "mlflow" and self.uri is not None:
+            raise UserError("uri", f"is an address of MLflow, tracking.writer is {self.writer}", "leave one out")
+        return self
 
 
 class RunSection(Schema):

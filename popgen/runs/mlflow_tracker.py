@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shlex
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -39,8 +40,11 @@ PICTURE = "artefact:"
 
 _NOTE = "mlflow.note.content"
 _NOTE_LENGTH = 5000
-_FOLDED = re.compile(r"(^|/)(precision|recall)_")
-"""Figures of single events: a dozen tiles that say little alone. They stay in metrics.jsonl and in the run's page."""
+_SINGLE_EVENT = re.compile(r"(?:^|/)((?:precision|recall)_.*)")
+"""Figures of single events: dozens of tiles that say little alone."""
+
+SINGLE_EVENTS = "single_events/"
+"""Their prefix, which MLflow's page folds into one section."""
 
 _TAGS = {
     **{"method": ("method",), "layout": ("env.name", "environment")},
@@ -75,6 +79,25 @@ def view_address(state: Mapping[str, Any], server: str = "http://127.0.0.1:5000"
     experiment, run = state.get("experiment"), state.get("runs", {}).get("parent")
     place = f"experiments/{experiment}" if experiment else "experiments"
     return f"{server}/#/{place}{f'/runs/{run}' if experiment and run else ''}?workflowType=machine_learning"
+
+
+def address_in_mlflow(tracking: TrackingConfig, state: Mapping[str, Any], store: Path) -> dict[str, str]:
+    """How to look at a run: the command that serves the pages (none for a server, which does already) and the address.
+
+    Args:
+        tracking: where to.
+        state: of a tracker.
+        store: folder of the default store.
+    """
+    if tracking.uri is not None and tracking.uri.startswith("http"):
+        return {"command": "", "address": view_address(state, mask_credentials(tracking.uri).rstrip("/"))}
+    uri = tracking.uri or sqlite_uri(store / STORE)
+    return {"command": f"mlflow ui --backend-store-uri {shlex.quote(uri)}", "address": view_address(state)}
+
+
+def _group_figure(name: str) -> str:
+    found = _SINGLE_EVENT.search(name)
+    return f"{SINGLE_EVENTS}{found[1]}" if found else name
 
 
 class Tracker:
@@ -141,8 +164,7 @@ class Tracker:
 
         now = int(time.time() * 1000) if when is None else when
         points = self._points.setdefault(member, [])
-        kept = {name: value for name, value in metrics.items() if not _FOLDED.search(name)}
-        points += [Metric(name, float(value), now, int(step)) for name, value in kept.items()]
+        points += [Metric(_group_figure(name), float(value), now, int(step)) for name, value in metrics.items()]
         if len(points) >= BATCH:
             self.flush()
 

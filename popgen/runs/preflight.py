@@ -17,6 +17,7 @@ from popgen.errors import UserError
 from popgen.methods.method import Continuation, Method, Needs
 from popgen.methods.registry import METHODS
 from popgen.runs import sizes
+from popgen.runs.chart_trackers import check_writer
 from popgen.runs.ray_folder import check_ray_folder
 from popgen.runs.resources import MOST_ON_A_CORE, count_cores, demands, total
 from popgen.runs.tracking_address import check_uri
@@ -50,6 +51,7 @@ def preflight(config: RunConfig) -> EnvSpec:
     method.check(config, spec)
     if config.tracking.enabled:
         check_uri(config.tracking.uri)
+        check_writer(config.tracking)
     if config.population.init_from is not None:
         _check_start(config, spec, method)
     needs = method.needs(config, spec)

@@ -75,7 +75,7 @@ def _check_server(uri: str, timeout: float) -> None:
         ).close()
     except (OSError, ValueError) as error:  # requests' own errors are of the first kind, bad addresses of the second
         raise UserError(
-            "tracking.uri", f"no server answers at {uri} ({_last_reason(error)})", "start it or use tracking=sqlite"
+            "tracking.uri", f"no server answers at {uri} ({_last_reason(error)})", "start it or use tracking=mlflow"
         ) from None
 
 

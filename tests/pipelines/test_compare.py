@@ -94,6 +94,8 @@ def test_compare_gives_tables_charts_and_mlflow_metrics_by_number_of_agents(run:
     assert history(lipo, SCALING_METRIC) == [(0, 0), (1, 800), (2, 2000)]
     assert history("comparison", f"environment_steps/{lipo}") == [(0, 0), (1, 800), (2, 2000)]
     parent = found["comparison"].info.run_id
+    place = f"experiments/{experiment.experiment_id}/runs/{parent}?workflowType=machine_learning"
+    assert told["tracking"]["address"] == f"http://127.0.0.1:5000/#/{place}"
     assert all(found[name].data.tags["mlflow.parentRunId"] == parent for name in found if name != "comparison")
     assert all(
         any(point.value for point in client.get_metric_history(one.info.run_id, metric))
