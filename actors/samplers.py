@@ -7,14 +7,16 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from popgen.actors.actor_setup import build_env, limit_threads
+from popgen.actors.actor_setup import limit_threads
 from popgen.config.run_config import RunConfig
 from popgen.config.sections import EnvConfig
+from popgen.envs import EnvSpec, make_env
 from popgen.errors import UserError
 from popgen.methods.training import Collected, Pending, PolicySnapshot, Sampled, SegmentCount
 from popgen.methods.transport import Place, Transport, Worker
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match, split_matches
+from popgen.play.policy import Policy
 from popgen.play.rollout import Sampler
 from popgen.policies.policy_registry import build_policy
 from popgen.types import Kind, Segment
@@ -36,15 +38,26 @@ class SamplerActor:
         self.env_config, self.name, self.transport = env, name, transport
         self.sequence = 0
         self.sampler: Sampler | None = None
+        self.played: dict[int, tuple[dict[str, Any], Policy]] = {}
 
     def open(self, matches: list[Match], policies: dict[int, PolicySnapshot], seed: int, stagger: bool = False) -> None:
         """Start fresh episodes of the given matches; `policies` holds one for every member in them."""
-        env = build_env(self.env_config, sum(match.envs for match in matches), seed)
-        built = {
-            member: build_policy(policy.kind, policy.config, policy.weights.result(), env.spec)
-            for member, policy in policies.items()
-        }
-        self.sampler = Sampler(env, matches, built, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence)
+        envs = sum(match.envs for match in matches)
+        env = make_env(self.env_config.name, envs, seed=seed, **self.env_config.params)
+        players = {member: self._find_policy(member, snapshot, env.spec) for member, snapshot in policies.items()}
+        self.played = {member: (policies[member].config, player) for member, player in players.items()}
+        self.sampler = Sampler(
+            env, matches, players, name=self.name, seed=seed, stagger=stagger, sequence=self.sequence
+        )
+
+    def _find_policy(self, member: int, snapshot: PolicySnapshot, spec: EnvSpec) -> Policy:
+        """The member's policy: that of its last matches with new weights, a new one where it cannot take them."""
+        config, policy = self.played.get(member, ({}, None))
+        same = policy is not None and (policy.kind, config) == (snapshot.kind, snapshot.config)
+        if not same or not isinstance(policy, Learning):
+            return build_policy(snapshot.kind, snapshot.config, snapshot.weights.result(), spec)
+        policy.load(snapshot.weights.result())
+        return policy
 
     def collect(self, steps: int, member: int | None = None, weights: Pending[Weights] | None = None) -> Sampled:
         """Play `steps` joint steps, with new weights for one member if given. Segments stay in the store, by kind."""

@@ -1,9 +1,16 @@
-"""Frozen records that pass between the rooms of popgen (see shapes.py for the dimensions)."""
+"""Frozen records that pass between the rooms of popgen, and the dimensions of every docstring.
+
+B batch            T time               P players (2)        E events per player
+S state numbers    F features of a view A actions            M members
+D deterministic    G latent groups      C classes of a group L length of a replay window
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -110,3 +117,10 @@ class LedgerEntry:
     @property
     def key(self) -> tuple[str, int, str, str, int]:
         return (self.run, self.member, str(self.kind), self.sampler, self.sequence)
+
+
+def check(array: Any, shape: Sequence[int | None], name: str) -> None:
+    """Raise ValueError unless `array.shape` equals `shape` (None matches any size)."""
+    got = tuple(array.shape)
+    if len(got) != len(shape) or any(want is not None and want != have for want, have in zip(shape, got, strict=True)):
+        raise ValueError(f"{name}: expected shape {tuple(shape)}, got {got}")

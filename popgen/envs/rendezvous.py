@@ -29,8 +29,7 @@ import numpy as np
 from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
 from popgen.envs.rendezvous_pictures import draw_map, draw_picture
 from popgen.errors import UserError
-from popgen.shapes import check
-from popgen.types import StepBatch
+from popgen.types import StepBatch, check
 
 ACTION_NAMES = ("stay", "left", "right", "down", "up")
 FORCES = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=np.float64)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from popgen.shapes import check
+from popgen.types import check
 
 EXHAUSTIVE = 200_000
 """Subsets that are all tried when the most diverse one is looked for; with more of them it is built step by step."""

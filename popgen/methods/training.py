@@ -31,6 +31,12 @@ may stand in for a value: the process that writes the files resolves it, so that
 
 Figures = Mapping[str, float]
 
+
+def named_figures(learner: str, metrics: Figures) -> dict[str, float]:
+    """A learner's metrics as figures of the run: `LEARNER/NAME`."""
+    return {f"{learner}/{name}": value for name, value in metrics.items()}
+
+
 T = TypeVar("T", covariant=True)
 
 

@@ -1,8 +1,8 @@
 """A GRU over many time steps, with rows that forget at given steps, for a processor.
 
-`torch.nn.GRU` on a processor takes each step's gradients apart in dozens of small operations, and a row that begins anew
-ends its call. Here only the product with the recurrent weights is one of each step; gates' factors and the gradients of
-the weights are of all steps at once. Values and gradients are those of `torch.nn.GRU`.
+`torch.nn.GRU` on a processor takes each step's gradients apart in dozens of small operations, and a row that begins
+anew ends its call. Here only the product with the recurrent weights is one of each step; gates' factors and the
+gradients of the weights are of all steps at once. Values and gradients are those of `torch.nn.GRU`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class _UnrolledGru(torch.autograd.Function):
         # what a gradient of h' is multiplied by on its way to the sums inside of n, r, z and of the recurrent part of n
         to_new = (1.0 - update) * (1.0 - new * new)
         factors = torch.stack(
-            [to_new * recurrent_new * reset * (1.0 - reset), (before - new) * update * (1.0 - update), to_new * reset], 2
+            [to_new * recurrent_new * reset * (1.0 - reset), (before - new) * update * (1.0 - update), to_new * reset],
+            2,
         )
         spread, arrived = torch.empty_like(factors), torch.empty_like(new)
         carried = torch.zeros_like(new[0])

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from popgen.play.policy import Policy, Remembering
-from popgen.shapes import check
-from popgen.types import RANDOM_MEMBER, Kind
+from popgen.types import RANDOM_MEMBER, Kind, check
 
 
 @dataclass(frozen=True)

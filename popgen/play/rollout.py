@@ -12,8 +12,7 @@ from popgen.envs.contract import BatchedEnv
 from popgen.play.episodes import Episode, Episodes
 from popgen.play.matches import Match, Seating, columns_of, match_of_columns
 from popgen.play.policy import Policy
-from popgen.shapes import check
-from popgen.types import Segment, StepBatch
+from popgen.types import Segment, StepBatch, check
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.nets.blocks import draw_by_multinomial
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.nets.weights import load_weights, weights_of
-from popgen.shapes import check
+from popgen.types import check
 
 
 class FeedForwardSeat(nn.Module):

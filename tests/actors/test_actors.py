@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from support.small import kitchen, random_play
 
 from popgen.actors.samplers import SamplerActor
@@ -11,6 +12,8 @@ from popgen.actors.xpm_wm_actors import ReplayActor
 from popgen.config.sections import EnvConfig
 from popgen.methods.training import PolicySnapshot
 from popgen.methods.transport import InlineTransport, Ready
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
+from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.replay import Query, Request
 from popgen.play.matches import Match
 from popgen.types import RANDOM_MEMBER, Kind
@@ -61,3 +64,29 @@ def test_segment_numbers_continue_over_matches_and_segments_are_handed_on_by_kin
             assert sampled.collected.steps == 5 * sum(match.envs for match in matches)
             keys += [(s.sampler, s.sequence) for s in segments]
     assert keys == [("sampler0.1", number) for number in range(8)]
+
+
+def member_snapshot(seed: int, units: int = 8) -> PolicySnapshot:
+    """A fresh world-model policy as it travels."""
+    model, agent = WorldModelConfig(deter=16, units=units, groups=4, joint_groups=2), AgentConfig(units=units)
+    torch.manual_seed(seed)
+    policy = WorldModelPolicy(model, agent, kitchen().spec)
+    return PolicySnapshot(policy.kind, policy.config(), Ready(policy.weights()))
+
+
+def test_a_policy_that_a_sampler_keeps_plays_its_new_weights_like_a_fresh_one() -> None:
+    matches = [Match(Kind.SP, (1, 1), 3)]
+    used = SamplerActor(ENV, "s", 1, InlineTransport())
+    used.open(matches, {1: member_snapshot(1)}, seed=5)
+    used.collect(7)
+    kept = used.sampler and used.sampler.policies[1]
+    for units in (8, 12):  # with the same sizes it is kept, with others it is built anew
+        fresh = SamplerActor(ENV, "s", 1, InlineTransport())
+        fresh.sequence = used.sequence
+        played = []
+        for sampler in (used, fresh):
+            sampler.open(matches, {1: member_snapshot(2, units)}, seed=6)
+            played.append(sampler.collect(9).segments[Kind.SP].result())
+        assert used.sampler is not None and (used.sampler.policies[1] is kept) == (units == 8)
+        for one, two in zip(*played, strict=True):
+            assert one.sequence == two.sequence and np.array_equal(one.actions, two.actions)

@@ -14,7 +14,7 @@ from popgen.methods.ego.ego_networks import EgoSizes, build_network
 from popgen.methods.ego.two_levels import draw_durations
 from popgen.nets.blocks import draw_by_gumbel
 from popgen.nets.weights import Weights, load_weights, weights_of
-from popgen.shapes import check
+from popgen.types import check
 
 
 class EgoPolicy:

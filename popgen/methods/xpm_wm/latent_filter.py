@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.methods.xpm_wm.config import WorldModelConfig
 from popgen.nets.blocks import ConvEncoder, NormGRUCell, mlp
-from popgen.shapes import check
+from popgen.types import check
 
 
 @dataclass(frozen=True)

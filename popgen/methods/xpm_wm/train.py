@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import replace
 
-from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled
+from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled, named_figures
 from popgen.methods.xpm_wm import phase_rules as rules
 from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
@@ -23,7 +23,6 @@ from popgen.methods.xpm_wm.workers import (
     ModelTask,
     ModelUpdate,
     Setup,
-    named_figures,
 )
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER

@@ -215,8 +215,3 @@ class Setup:
     member: int
     seed: int
     archive: Mapping[int, Pending[Weights]]
-
-
-def named_figures(learner: str, metrics: Mapping[str, float]) -> dict[str, float]:
-    """A learner's metrics as figures of the run: `LEARNER/NAME`."""
-    return {f"{learner}/{name}": value for name, value in metrics.items()}
