@@ -1,4 +1,5 @@
-"""The rules that end a phase: functions of a progress record and the recipe; nothing runs for them."""
+"""Rules that end a phase, and what is said of a round: functions of a progress record and the recipe; nothing runs for
+them."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from popgen.methods.training import Progress, Round, Sampled
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.member_progress import (
     Candidate,
@@ -45,6 +47,11 @@ RANDOM_PLAY, MODEL_ALONE, SELF_PLAY, IMAGINATION = "random play", "world model",
 def self_play_steps(phase: Phase1Config) -> int:
     """Environment steps of self-play at most."""
     return max(1, phase.max_steps - phase.prefill_steps)
+
+
+def count_self_play(progress: FirstMemberProgress, phase: Phase1Config) -> int:
+    """Environment steps after random play."""
+    return max(0, progress.steps - phase.prefill_steps)
 
 
 def count_imagination(phase: Phase2Config, rounds: int) -> int:
@@ -116,6 +123,26 @@ def window_figures(progress: FirstMemberProgress, horizon: int) -> dict[str, flo
     if not progress.recent:
         return {}
     return {"real_sp": mean_score(progress), "real_shaped_sp": float(np.mean(progress.shaped)) / horizon}
+
+
+def describe_random_play(progress: FirstMemberProgress, sampled: tuple[Sampled, ...]) -> Progress:
+    """Random episodes so far."""
+    steps, member = progress.steps, 1
+    return Progress(member, steps, sampled=sampled, done=steps, shown={"steps": steps})
+
+
+def describe_first_round(progress: FirstMemberProgress, phase: Phase1Config, score_name: str) -> Round:
+    """The round that has ended, with the figures so far."""
+    figures, steps, member = dict(progress.figures), progress.steps, 1
+    shown = {"steps": steps, score_name: round(figures.get("real_sp", 0.0), 2)}
+    done = count_self_play(progress, phase)
+    return Round(member, steps, figures, done=done, shown=shown, number=progress.rounds)
+
+
+def describe_confirmation(progress: FirstMemberProgress, score: float, episodes: int, score_name: str) -> str:
+    """Whole episodes of the last policy in a line."""
+    outcome = "taken" if progress.confirmed else "learning continues"
+    return f"member 1: {score:.2f} {score_name} in {episodes} episodes of one policy: {outcome}"
 
 
 def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after: float) -> None:
@@ -192,6 +219,15 @@ def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name:
     """A round in a line."""
     scores = f"SP {scored.sp:.2f}, strongest XP {scored.xp:.2f} {score_name}"
     return f"round {progress.rounds}: {scores}, {progress.steps:,} steps"
+
+
+def describe_later_round(
+    progress: LaterMemberProgress, member: int, scored: Candidate, score_name: str, trouble: str
+) -> Round:
+    """The round that has ended, with its figures, and its line with signs of trouble."""
+    note = f"member {member}, {describe_round(progress, scored, score_name)}"
+    note += f"; {trouble}" if trouble else ""
+    return Round(member, progress.steps, progress.figures, note=note, number=progress.rounds)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,11 @@ def policy_snapshot(config: XpmWmRun, acting: Pending[Weights]) -> PolicySnapsho
     """A member's policy as it travels to a sampler."""
     sizes = {"world_model": config.world_model.model_dump(mode="json"), "agent": config.agent.model_dump(mode="json")}
     return PolicySnapshot("world_model", sizes, acting)
+
+
+def policy_snapshots(config: XpmWmRun, acting: Mapping[int, Pending[Weights]]) -> dict[int, PolicySnapshot]:
+    """Policies of members by their acting weights."""
+    return {member: policy_snapshot(config, weights) for member, weights in acting.items()}
 
 
 def random_snapshot(spec: EnvSpec, interact: float, put: Callable[[Any], Pending[Any]]) -> PolicySnapshot:

@@ -15,15 +15,7 @@ from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.overlap import Overlap
-from popgen.methods.xpm_wm.real_play import Tally
-from popgen.methods.xpm_wm.workers import (
-    AgentTask,
-    AgentUpdate,
-    ModelReports,
-    ModelTask,
-    ModelUpdate,
-    Setup,
-)
+from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, ModelTask, ModelUpdate, Setup
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER
 
@@ -40,7 +32,7 @@ class FirstMember:
 
     def __init__(self, setup: Setup, progress: FirstMemberProgress) -> None:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
-        self.phase, self.progress = self.config.phase1, progress
+        self.phase, self.progress, self.tally = self.config.phase1, progress, setup.tally
         self.reports = ModelReports(self.work, self.phase.check_every, waits=self.config.run.schedule == "sync")
 
     def train(self, resumed: bool) -> Loop:
@@ -48,7 +40,8 @@ class FirstMember:
         if not resumed:
             yield from self.collect_random_episodes()
             yield from self.pretrain()
-        yield Phase(rules.SELF_PLAY, rules.self_play_steps(self.phase), FIRST, done=self.count_self_play())
+        done = rules.count_self_play(self.progress, self.phase)
+        yield Phase(rules.SELF_PLAY, rules.self_play_steps(self.phase), FIRST, done=done)
         if not resumed:
             self.start_self_play()
             yield Round(FIRST, self.progress.steps, number=0, must_save=True)
@@ -59,10 +52,6 @@ class FirstMember:
                 return rules.choose_first(self.progress)
             self.start_self_play()
 
-    def count_self_play(self) -> int:
-        """Environment steps after random play."""
-        return max(0, self.progress.steps - self.phase.prefill_steps)
-
     def collect_random_episodes(self) -> Records:
         """Lines 2 and 3: B_SP is populated with K random episodes."""
         phase, progress = self.phase, self.progress
@@ -72,8 +61,7 @@ class FirstMember:
         while progress.steps < phase.prefill_steps:
             missing = (phase.prefill_steps - progress.steps) // phase.envs
             self.add_to_buffers(sampled := self.work.collect(max(1, min(PREFILL_CHUNK, missing))))
-            steps = progress.steps
-            yield Progress(FIRST, steps, sampled=tuple(sampled), done=steps, shown={"steps": steps})
+            yield rules.describe_random_play(progress, tuple(sampled))
 
     def pretrain(self) -> Records:
         """World-model updates alone, in pieces for the progress bar; then the agent's first ones."""
@@ -91,7 +79,7 @@ class FirstMember:
     def start_self_play(self, stagger: bool = True) -> None:
         """Fresh episodes of the published policy."""
         seed = self.seed + 10_000 * (2 * self.progress.confirmations - (not stagger))
-        policies = {FIRST: real.policy_snapshot(self.config, self.progress.latest.acting)}
+        policies = real.policy_snapshots(self.config, {FIRST: self.progress.latest.acting})
         self.work.start_episodes([real.self_play_match(FIRST, self.phase.envs)], policies, seed, stagger)
 
     def play_rounds(self, overlap: Overlap) -> Records:
@@ -132,10 +120,6 @@ class FirstMember:
         recent = self.phase.envs * self.phase.steps_per_iteration if discovery.trust else 0
         return self.work.update_world_model(ModelTask(updates, self.config.agent.starts_sp, chosen, rare, recent))
 
-    def tally(self) -> Tally | None:
-        """What real play has shown so far, where anything goes by it."""
-        return self.work.tally(FIRST).result() if rules.goes_by_tally(self.config.discovery) else None
-
     def update_agent(self) -> Pending[AgentUpdate]:
         """Lines 8 and 12 to 15, without partners."""
         progress = self.progress
@@ -150,8 +134,7 @@ class FirstMember:
             sampled.append(result)
             return 0.0, result.collected.cpu_seconds
         if isinstance(result, ModelUpdate):
-            progress.model, progress.starts = result.weights, result.starts
-            progress.recent_starts = result.recent
+            progress.model, progress.starts, progress.recent_starts = result.weights, result.starts, result.recent
         else:
             progress.published = result.weights
         progress.figures |= named_figures(kind, result.metrics)
@@ -165,18 +148,15 @@ class FirstMember:
 
     def end_round(self, overlap: Overlap, sampled: tuple[Sampled, ...]) -> Round:
         """Judge the round; start actor and critics again if that is due."""
-        progress, steps = self.progress, self.progress.steps
+        progress, watch = self.progress, self.config.watch
         progress.rounds += 1
-        progress.figures |= rules.window_figures(progress, self.spec.horizon)
         report = self.reports.after_round(progress.rounds)
-        progress.figures |= report | overlap.figures()
-        figures, watch = dict(progress.figures), self.config.watch
+        progress.figures |= rules.window_figures(progress, self.spec.horizon) | report | overlap.figures()
         rules.keep_best(progress, self.phase, self.config.agent.entropy_after)
-        shown = {"steps": steps, self.spec.score_name: round(figures.get("real_sp", 0.0), 2)}
-        trouble = progress.watch.look(figures, report, watch, watch.first_rounds)
+        trouble = progress.watch.look(progress.figures, report, watch, watch.first_rounds)
         note = self.restart_if_due() or (trouble and f"member 1: {trouble}")
-        ended = Round(FIRST, steps, figures, sampled, number=progress.rounds, at_rest=not overlap.running)
-        return replace(ended, done=self.count_self_play(), shown=shown, note=note, work=dict(overlap.work))
+        ended = rules.describe_first_round(progress, self.phase, self.spec.score_name)
+        return replace(ended, sampled=sampled, at_rest=not overlap.running, note=note, work=dict(overlap.work))
 
     def restart_if_due(self) -> str:
         """Line 1 again on the world model learned so far; a note about it."""
@@ -189,8 +169,7 @@ class FirstMember:
         return f"member 1: actor and critics start again on the world model of {self.progress.steps:,} steps"
 
     def confirm(self) -> Generator[Record, bool | None, bool]:
-        """Whether the last policy is good by itself: a whole episode of it in each environment. Where the budget leaves
-        no room for that, the window must do."""
+        """Whether a whole episode of the last policy in each environment is good; so where the budget has no room."""
         progress = self.progress
         if not rules.may_confirm(progress, self.phase, self.spec.horizon):
             return True
@@ -198,8 +177,7 @@ class FirstMember:
         self.start_self_play(stagger=False)
         episodes = self.add_to_buffers(sampled := self.work.collect(self.spec.horizon))
         score = rules.confirm_policy(progress, episodes, self.phase)
-        outcome = "taken" if progress.confirmed else "learning continues"
-        note = f"member 1: {score:.2f} {self.spec.score_name} in {len(episodes)} episodes of one policy: {outcome}"
+        note = rules.describe_confirmation(progress, score, len(episodes), self.spec.score_name)
         yield Progress(FIRST, progress.steps, sampled=tuple(sampled), note=note)
         return progress.confirmed
 
@@ -210,7 +188,7 @@ class LaterMember:
     def __init__(self, setup: Setup, progress: LaterMemberProgress) -> None:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
         self.member, self.archive = setup.member, setup.archive
-        self.phase, self.progress = self.config.phase2, progress
+        self.phase, self.progress, self.tally = self.config.phase2, progress, setup.tally
         self.pairs = real.seatings(self.member, sorted(self.archive))
         # Every partner's cross-play must be known to tell the strongest, in both seats.
         self.episodes_xp = max(self.phase.episodes_xp, len(self.pairs))
@@ -239,17 +217,15 @@ class LaterMember:
         progress, plan = self.progress, rules.plan_imagination(self.progress.rounds, self.phase)
         scores = progress.strength.scores()  # 9
         starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
-        tally = self.work.tally(self.member).result() if rules.goes_by_tally(self.config.discovery) else None
-        done, best = plan.done, progress.best_shown
+        tally, done, best = self.tally(), plan.done, progress.best_shown
         while True:
             count = min(AGENT_PIECE, plan.done + plan.updates - done)
             task = AgentTask(count, model, starts, plan.new_share, scores, progress.plays, tally)
             update = self.work.update_agent(task).result()  # 11-15
-            figures = named_figures("agent", update.metrics) | {"updates": done}
-            self.imagined = figures
+            self.imagined = named_figures("agent", update.metrics) | {"updates": done}
             shown = {"steps": progress.steps, "entropy": round(update.metrics["entropy"], 2), **best}
             done += count
-            yield Progress(self.member, progress.steps, figures, done=done, shown=shown)
+            yield Progress(self.member, progress.steps, self.imagined, done=done, shown=shown)
             if done == plan.done + plan.updates:
                 return update.weights
 
@@ -258,20 +234,17 @@ class LaterMember:
         pair is met in an order drawn for the round."""
         seed = self.seed * 100 + self.progress.rounds + 1
         matches = real.later_matches(self.member, self.pairs, self.phase.episodes_sp, self.episodes_xp, seed)
-        acting = {**self.archive, self.member: published.acting}
-        policies = {member: real.policy_snapshot(self.config, weights) for member, weights in acting.items()}
+        policies = real.policy_snapshots(self.config, {**self.archive, self.member: published.acting})
         self.work.start_episodes(matches, policies, seed)
         return self.work.collect(self.spec.horizon)
 
     def judge(self, published: MemberWeights, sampled: list[Sampled]) -> Round:
         """What the real episodes say: whether this is the best round, and each partner's cross-play return."""
-        progress = self.progress
+        progress, watch = self.progress, self.config.watch
         progress.steps += real.steps_of(sampled)
         scored = rules.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
         progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
-        note, watch = rules.describe_round(progress, scored, self.spec.score_name), self.config.watch
-        if trouble := progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds):
-            note += f"; {trouble}"
-        rests, number = rules.plays_on(progress, self.phase, self.most_rounds), progress.rounds
-        ended = Round(self.member, progress.steps, progress.figures, tuple(sampled), number=number, at_rest=rests)
-        return replace(ended, note=f"member {self.member}, {note}")
+        trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
+        ended = rules.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)
+        at_rest = rules.plays_on(progress, self.phase, self.most_rounds)
+        return replace(ended, sampled=tuple(sampled), at_rest=at_rest)

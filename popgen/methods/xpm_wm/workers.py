@@ -11,6 +11,7 @@ from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import MemberWeights
+from popgen.methods.xpm_wm.phase_rules import goes_by_tally
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match
@@ -215,3 +216,7 @@ class Setup:
     member: int
     seed: int
     archive: Mapping[int, Pending[Weights]]
+
+    def tally(self) -> Tally | None:
+        """What real play has shown so far, where anything goes by it."""
+        return self.work.tally(self.member).result() if goes_by_tally(self.config.discovery) else None
