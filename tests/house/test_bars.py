@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from house.figures import BARS, ROOT, Bar, find_import_cycles, find_late_attributes, judge, measure_short_helpers
+from house.round_files import MOST, find_round_files
 
 OPEN: set[str] = set()
 """Bars that are not reached yet; a name leaves this list for good."""
@@ -16,6 +17,13 @@ OPEN: set[str] = set()
 def test_the_bar_holds(bar: Bar) -> None:
     figure, lines = judge(bar, ROOT)
     assert figure <= bar.most, "\n".join([f"{figure:g}, at most {bar.most:g}", *lines])
+
+
+def test_a_round_of_a_later_member_goes_through_few_files() -> None:
+    """`python tests/house/round_files.py` prints them."""
+    files = find_round_files()
+    assert len(files) <= MOST, "\n".join(files)
+    assert any("xpm_wm/train.py" in line for line in files)
 
 
 @pytest.fixture

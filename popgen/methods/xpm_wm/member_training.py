@@ -10,6 +10,7 @@ from popgen.methods.xpm_wm import phase_rules as rules
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
+from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
@@ -95,7 +96,10 @@ class XpmWmTraining:
         yield from self._complete(candidate)
 
     def _setup(self) -> Setup:
-        return Setup(self.work, self.config, self.spec, self.member, self.seed, self.archive)
+        return Setup(self.work, self.config, self.spec, self.member, self.seed, self.archive, self._read_tally)
+
+    def _read_tally(self) -> Tally | None:
+        return self.work.tally(self.member).result() if rules.goes_by_tally(self.config.discovery) else None
 
     def _first(self) -> FirstMember:
         assert isinstance(self.progress, FirstMemberProgress)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +11,6 @@ from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import MemberWeights
-from popgen.methods.xpm_wm.phase_rules import goes_by_tally
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match
@@ -208,6 +207,7 @@ class Setup:
         config, spec: of the run and its environment.
         member, seed: its number and the seed of everything in it.
         archive: acting weights of the members before it.
+        tally: what real play has shown so far; None where nothing goes by it.
     """
 
     work: Workers
@@ -216,7 +216,4 @@ class Setup:
     member: int
     seed: int
     archive: Mapping[int, Pending[Weights]]
-
-    def tally(self) -> Tally | None:
-        """What real play has shown so far, where anything goes by it."""
-        return self.work.tally(self.member).result() if goes_by_tally(self.config.discovery) else None
+    tally: Callable[[], Tally | None]
