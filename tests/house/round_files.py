@@ -2,6 +2,7 @@
 
 Round 2 of member 2 of XPM-WM at scale=smoke, workers in this process: every function of this project that is called
 between the end of round 1 and the end of round 2 counts for the file that defines it. Files of environments do not.
+Round 2 is the last one here, so that no checkpoint follows it.
 """
 
 from __future__ import annotations

@@ -11,7 +11,8 @@ import pytest
 from popgen.config.sections import TrackingConfig
 from popgen.errors import UserError
 from popgen.methods.xpm_wm.config import XpmWmRun
-from popgen.runs.mlflow_tracker import SCALING_METRIC, Tracker, choose_store, view_address
+from popgen.runs.mlflow_tracker import SCALING_METRIC, STORE, LocalTracker, Tracker, choose_store, view_address
+from popgen.runs.tracking_address import sqlite_uri
 
 
 def history(tracker: Tracker, run: str, metric: str) -> list[tuple[int, float]]:
@@ -222,3 +223,40 @@ def test_a_store_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot open") as caught:
         Tracker(TrackingConfig(uri=f"sqlite:///{tmp_path}/file/x.db"), tmp_path, "r")
     assert "\n" not in str(caught.value)
+
+
+def test_a_local_tracker_opens_late_and_goes_on_in_the_same_runs(tmp_path: Path) -> None:
+    from mlflow.tracking import MlflowClient
+
+    arguments = (TrackingConfig(), tmp_path, "run-1", XpmWmRun().model_dump(mode="json"))
+    first = LocalTracker(*arguments)
+    first.log({"loss": 1.0}, step=1, member=1)
+    first.log_scaling(1, 10)
+    first.finish("FAILED")
+    assert first.flush() == {} and not list(tmp_path.iterdir())  # before `start` nothing happens
+    first.start()
+    first.start()  # once more changes nothing
+    first.log({"loss": 2.0}, step=2, member=1)
+    state = json.loads(json.dumps(first.flush()))
+    first.forget()  # there is no process to forget
+    second = LocalTracker(*arguments)
+    second.start(state)
+    second.log({"loss": 3.0}, step=3, member=1)
+    second.log_scaling(1, 600)
+    second.describe("*text*")
+    second.log_artifact(tmp_path / "mlflow.db", "copy")
+    assert second.flush()["runs"] == state["runs"]
+    second.finish("KILLED")
+    assert second.flush() == {}
+    store = MlflowClient(tracking_uri=sqlite_uri(tmp_path / STORE))
+    losses = store.get_metric_history(state["runs"]["member_001"], "loss")
+    assert [(point.step, point.value) for point in losses] == [(2, 2.0), (3, 3.0)]
+    parent = store.get_run(state["runs"]["parent"])
+    assert parent.data.metrics[SCALING_METRIC] == 600.0 and parent.info.status == "KILLED"
+    assert "*text*" in parent.data.tags["mlflow.note.content"]
+
+
+def test_a_local_tracker_names_a_store_that_cannot_be_opened_once_it_starts(tmp_path: Path) -> None:
+    tracker = LocalTracker(TrackingConfig(uri="sqlite:////proc/nothing/mlflow.db"), tmp_path, "run-1", {})
+    with pytest.raises(UserError, match="tracking.uri: cannot open"):
+        tracker.start()
