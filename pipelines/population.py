@@ -256,10 +256,10 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
 
 def list_weak_members(config: RunConfig, recorder: RunRecorder, result: CrossPlayResult) -> list[WeakMember]:
     """Members that do not play, by their methods' targets where there are any, and by each other; a member that is kept
-    for its lower skill (`extra.skill`) is meant to be weak."""
+    for its lower skill (`extra.skill`) is meant to be weak, one of a pair (`extra.role`) is not meant for itself."""
     infos = load_population(recorder.dir / "population").members
     targets = {info.id: float(info.extra["target"]) for info in infos if "target" in info.extra}
-    meant = {info.id for info in infos if info.extra.get("skill", FINAL_SKILL) != FINAL_SKILL}
+    meant = {one.id for one in infos if one.extra.get("skill", FINAL_SKILL) != FINAL_SKILL or "role" in one.extra}
     found = find_weak_members(result, targets, config.evaluation.weak_share)
     return [one for one in found if one.member not in meant]
 

@@ -11,7 +11,6 @@ beside pandas 3 (it pins arch 7.2).
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,12 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from popgen.types import check
-
-EXHAUSTIVE = 200_000
-"""Subsets that are all tried when the most diverse one is looked for; with more of them it is built step by step."""
-
-_COLUMN_MARGIN = 1e-3
-"""ZSC-Eval's, beside a column's maximum: events that nobody causes have no weight."""
 
 
 @dataclass(frozen=True)
@@ -44,21 +37,6 @@ class Interval:
     value: float
     low: float
     high: float
-
-
-@dataclass(frozen=True)
-class Diversity:
-    """BR-Div of a set of partners.
-
-    Attributes:
-        determinant: of the Gram matrix of normalised event counts; tiny for many near-collinear partners.
-        log_determinant: its logarithm, -inf for linearly dependent partners.
-        effective_rank: exp of the entropy of the Gram matrix's normalised eigenvalues, from 1 to K.
-    """
-
-    determinant: float
-    log_determinant: float
-    effective_rank: float
 
 
 def describe_spread(samples: np.ndarray) -> Spread:
@@ -164,71 +142,3 @@ def _resample(scores: np.ndarray, over_tasks: bool, rng: np.random.Generator) ->
     columns = rng.integers(tasks, size=tasks) if over_tasks else np.arange(tasks)
     rows = rng.integers(runs, size=(runs, tasks))
     return scores[rows, columns]
-
-
-def measure_diversity(events: np.ndarray) -> Diversity:
-    """BR-Div of partners by the mean event counts of their best responses (or of themselves).
-
-    Args:
-        events: (K, F) mean counts; each column is divided by its maximum (and a margin) before K = Phi Phi^T.
-    """
-    gram = _gram(events)
-    values = np.clip(np.linalg.eigvalsh(gram), 0.0, None)
-    sign, log_determinant = np.linalg.slogdet(gram)
-    shares = values / values.sum() if values.sum() > 0.0 else np.full(len(values), 1.0 / len(values))
-    entropy = -sum(share * math.log(share) for share in shares if share > 0.0)
-    log_determinant = float(log_determinant) if sign > 0.0 else -math.inf
-    return Diversity(math.exp(log_determinant), log_determinant, math.exp(entropy))
-
-
-def choose_most_diverse(events: np.ndarray, count: int) -> list[int]:
-    """Rows of the `count` partners whose Gram matrix has the largest determinant, ascending.
-
-    All subsets are tried while there are at most `EXHAUSTIVE` of them; otherwise the set is built one by one and then
-    improved by exchanges until none helps.
-
-    Raises:
-        ValueError: more partners wanted than there are.
-    """
-    gram = _gram(events)
-    size = len(gram)
-    if not 1 <= count <= size:
-        raise ValueError(f"count: {count} of {size} partners cannot be chosen")
-    if math.comb(size, count) <= EXHAUSTIVE:
-        subsets = itertools.combinations(range(size), count)
-        return list(max(subsets, key=lambda rows: _log_determinant(gram, rows)))
-    chosen: list[int] = []
-    for _ in range(count):
-        others = [row for row in range(size) if row not in chosen]
-        chosen.append(max(others, key=lambda row: _log_determinant(gram, [*chosen, row])))
-    return sorted(_exchange_rows(gram, chosen))
-
-
-def _exchange_rows(gram: np.ndarray, chosen: list[int]) -> list[int]:
-    """Replace one row by another as long as that raises the determinant."""
-    best = _log_determinant(gram, chosen)
-    improved = True
-    while improved:
-        improved = False
-        for place, row in itertools.product(range(len(chosen)), range(len(gram))):
-            if row in chosen:
-                continue
-            changed = [*chosen[:place], row, *chosen[place + 1 :]]
-            if (value := _log_determinant(gram, changed)) > best + 1e-12:
-                chosen, best, improved = changed, value, True
-    return chosen
-
-
-def _gram(events: np.ndarray) -> np.ndarray:
-    events = np.asarray(events, np.float64)
-    if events.ndim != 2 or not events.size:
-        raise ValueError(f"events: expected (partners, kinds), got shape {events.shape}")
-    if (events < 0.0).any():
-        raise ValueError("events: counts cannot be negative")
-    scaled = events / (events.max(axis=0) + _COLUMN_MARGIN)
-    return scaled @ scaled.T
-
-
-def _log_determinant(gram: np.ndarray, rows: list[int] | tuple[int, ...]) -> float:
-    sign, value = np.linalg.slogdet(gram[np.ix_(rows, rows)])
-    return float(value) if sign > 0.0 else -math.inf

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv
-from popgen.envs.overcooked import OvercookedEnv
-from popgen.envs.overcooked.transition_events import find_transition_events, hsp_events
-from popgen.evaluation.holdout_metrics import Diversity, choose_most_diverse, measure_diversity
+from popgen.envs.player_events import count_player_events
 from popgen.evaluation.holdout_players import Player
+from popgen.play.event_diversity import Diversity, choose_most_diverse, measure_diversity
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play
 
@@ -48,11 +47,7 @@ class _EventCounter:
         self.env, self.counts = env, np.zeros(0)
 
     def __call__(self, step: Transition) -> None:
-        if isinstance(self.env, OvercookedEnv):
-            events = hsp_events(find_transition_events(self.env, step.states, step.actions).astype(np.int64))
-        else:
-            events = step.result.events.astype(np.int64)
-        events = events * step.counted[:, None, None]
+        events = count_player_events(self.env, step.states, step.actions, step.result) * step.counted[:, None, None]
         self.counts = events if not self.counts.size else self.counts + events
 
 

@@ -7,16 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from popgen.evaluation import holdout_metrics as metrics
 from popgen.evaluation.holdout_metrics import (
     bootstrap_interval,
-    choose_most_diverse,
     describe_spread,
     find_worst,
     interquartile_mean,
     measure_br_proximity,
     measure_cvar,
-    measure_diversity,
     measure_regret,
     normalise_returns,
 )
@@ -81,39 +78,11 @@ def test_one_run_has_no_interval_over_runs() -> None:
     assert bootstrap_interval(np.array([[1.0, 2.0, 3.0, 4.0]]), over_tasks=True).value == 2.5
 
 
-def test_br_div_of_orthogonal_and_of_equal_partners() -> None:
-    orthogonal = measure_diversity(np.eye(3) * 5)
-    scale = 5 / (5 + 1e-3)
-    assert orthogonal.determinant == pytest.approx(scale**6) and orthogonal.effective_rank == pytest.approx(3.0)
-    equal = measure_diversity(np.array([[1.0, 2.0], [1.0, 2.0]]))
-    assert equal.determinant == pytest.approx(0.0, abs=1e-12) and equal.effective_rank == pytest.approx(1.0)
-
-
-def test_the_effective_rank_of_two_eigenvalues() -> None:
-    """Columns 1 and 0.5: the Gram matrix of rows (1, 1) and (1, 0) has trace 3 and determinant 1, margins aside."""
-    diversity = measure_diversity(np.array([[1e6, 1e6], [1e6, 0.0]]))
-    values = np.array([(3 + math.sqrt(5)) / 2, (3 - math.sqrt(5)) / 2]) / 3
-    assert diversity.determinant == pytest.approx(1.0, rel=1e-6)
-    assert diversity.effective_rank == pytest.approx(math.exp(-(values * np.log(values)).sum()), rel=1e-6)
-
-
-@pytest.mark.parametrize("limit", [10**9, 0])
-def test_the_most_diverse_are_found_with_and_without_trying_all(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
-    events = np.abs(np.random.default_rng(3).normal(size=(9, 6)))
-    events[4] = events[2] * 1.001  # a near copy must not be chosen beside its model
-    everything = choose_most_diverse(events, 4)
-    monkeypatch.setattr(metrics, "EXHAUSTIVE", limit)
-    chosen = choose_most_diverse(events, 4)
-    assert chosen == everything == sorted(chosen) and not {2, 4} <= set(chosen)
-
-
 def test_bad_arguments_are_refused() -> None:
     for call in (
         lambda: measure_cvar(np.ones(3), 0.0),
         lambda: measure_br_proximity(MEANS, BEST[:1]),
         lambda: bootstrap_interval(np.ones(4)),
-        lambda: measure_diversity(np.array([[-1.0]])),
-        lambda: choose_most_diverse(np.eye(3), 4),
         lambda: describe_spread(np.array([])),
     ):
         with pytest.raises(ValueError):

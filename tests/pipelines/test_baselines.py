@@ -269,6 +269,46 @@ def test_members_that_are_paid_for_diversity_learn_together(root: Path) -> None:
     assert all(np.isfinite(row["ppo/bonus"]) and row["ppo/bonus"] != 0.0 for row in rows)
 
 
+WITHOUT_WEIGHT = {
+    "mep": ("mep.alpha=0",),
+    "trajedi": ("trajedi.alpha=0",),
+    "e3t": ("e3t.epsilon=0",),
+    "hsp": ("hsp.members=partners", "hsp.pool=1", "hsp.spread=0"),
+}
+
+
+def test_a_weight_of_zero_is_mappo_bit_for_bit(root: Path) -> None:
+    """One member of each; HSP's utility is the true reward then, and one policy has both seats."""
+    plain = launch(root, "plain", "method=mappo", "population.size=1")
+    for method, overrides in WITHOUT_WEIGHT.items():
+        run = launch(root, f"{method}_without", f"method={method}", "population.size=1", *overrides)
+        assert run.sha256s() == plain.sha256s(), method
+        assert run.ledger() == plain.ledger(), method
+
+
+def test_hsp_keeps_pairs_with_their_roles_and_counts_the_whole_pool(root: Path) -> None:
+    """One pair of three, evenly counted; killed at the second iteration, or between two members, it ends the same."""
+    overrides = ("method=hsp", "population.size=2", "hsp.pool=3")
+    whole = launch(root, "hsp", *overrides)
+    for name, die_at in (("hsp_early", "train:2"), ("hsp_late", "added:1")):
+        with pytest.raises(Killed):
+            launch(root, name, *overrides, die_at=die_at)
+        again = launch(root, name, *overrides)
+        assert again.sha256s() == whole.sha256s() and again.ledger() == whole.ledger()
+    assert whole.said == {(pair, "SP"): SP_STEPS for pair in (1, 2, 3)}
+    assert whole.counted() == {(1, "SP"): 2 * SP_STEPS, (2, "SP"): SP_STEPS}
+    biased, partner = (whole.population.info(member).extra for member in (1, 2))
+    assert (biased["role"], partner["role"]) == ("biased", "partner")
+    assert biased["pair"] == partner["pair"] and biased["utility"] == partner["utility"]
+    assert 0 < sum(biased["events"].values()) != sum(partner["events"].values())
+
+
+def test_beside_a_mixture_partner_a_run_ends_as_any(root: Path) -> None:
+    run = launch(root, "e3t", "method=e3t", "population.size=1")
+    assert run.counted() == run.said == {(1, "SP"): SP_STEPS}
+    assert run.sha256s() != launch(root, "e3t_none", "method=e3t", "population.size=1", "e3t.epsilon=0").sha256s()
+
+
 METHODS = {
     "concurrent": ("method=lipo",),
     "sequential": ("method=lipo", "diversity.order=sequential"),

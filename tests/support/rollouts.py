@@ -42,6 +42,7 @@ def rollout(steps: int, *groups: Match, seed: int = 0, **given: Any) -> Rollout:
         "truncated": np.zeros((steps, count), bool),
         "seats": np.broadcast_to(match, (steps, count, 2)).astype(np.int32),
         "episodes": (),
+        "events": np.zeros((steps, count, 2, 0), np.uint8),
     }
     return Rollout(matches=tuple(groups), **(values | given))
 

@@ -16,6 +16,7 @@ from ray.rllib.core import COMPONENT_RL_MODULE
 from ray.rllib.env.env_runner import EnvRunner
 
 from popgen.envs import BatchedEnv, make_env
+from popgen.methods.mappo.noisy_actor import mix_with_random
 from popgen.methods.mappo.rl_module import module_id, module_spec, spaces
 from popgen.methods.mappo.slots import Actor, Rollout, SlotPool
 from popgen.methods.mappo.training_job import Job, sizes_of
@@ -64,7 +65,8 @@ class BatchedRunner(EnvRunner):
         matches = job.matches()
         mine = [replace(match, envs=0) for match in matches] if idle else share_of_each(matches, self.parts, self.part)
         seed = np.random.SeedSequence([job.seed, self.part, int(_was_restarted())])
-        self.pool = SlotPool(self._make_envs, mine, job.ppo.view, seed=int(seed.generate_state(1)[0]))
+        drawn, events = int(seed.generate_state(1)[0]), bool(job.utilities)
+        self.pool = SlotPool(self._make_envs, mine, job.ppo.view, seed=drawn, events=events)
         self.module = module_spec(job, self.spec, inference_only=True).build()
         self.frozen: dict[int, Actor] = {member: self._frozen_actor(weights) for member, weights in job.frozen.items()}
 
@@ -100,6 +102,8 @@ class BatchedRunner(EnvRunner):
             if member in weights:
                 load_weights(actor, weights[member])
             actors[member] = actor
+            if self.job.mate_of(member) == -member:
+                actors[-member] = mix_with_random(actor, self.job.noise)
         return actors
 
     def _frozen_actor(self, weights: Weights) -> FeedForwardNet:

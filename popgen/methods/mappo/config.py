@@ -189,6 +189,59 @@ class TrajediRun(BaselineRun):
     """The divergence of trajectories."""
 
 
+class E3tConfig(Schema):
+    """The partner of E3T (Yan et al. 2023): the member's own policy, mixed with chance."""
+
+    epsilon: Fraction = 0.25
+    """Share of uniformly random actions among the partner's (the paper's epsilon); 0 is MAPPO."""
+
+
+class E3tRun(BaselineRun):
+    """A run of E3T."""
+
+    method: Literal["e3t"] = "e3t"
+    """Play beside the own policy, which takes random actions now and then."""
+    e3t: E3tConfig = E3tConfig()
+    """The partner in training."""
+
+
+class HspConfig(Schema):
+    """Hidden-utility self-play (Yu et al. 2023): pairs of a biased agent and its partner."""
+
+    pool: Positive = 12
+    """Pairs that are trained together; the population is chosen from them, the others are counted and dropped."""
+    members: Literal["both", "biased", "partners"] = "both"
+    """Who of a chosen pair becomes a member; `both`: the biased agent, then its partner, two members a pair."""
+    select: Literal["events", "responses"] = "events"
+    """Pairs are chosen for the distance of the biased agents' events (HSP), or for the BR-Div of their partners', who
+    are their best responses (ZSC-Eval)."""
+    spread: Weight = 10.0
+    """Largest weight of an event, either sign, where a dish is worth 18 or more; a fiftieth of it for events that can
+    happen at every step. 0 leaves the true reward: one policy in both seats, which is MAPPO."""
+    biases: Positive = 3
+    """Events with a weight in each biased agent's utility, drawn from HSP's list."""
+    reward: Weight = 1.0
+    """Weight of the true reward in every utility."""
+
+
+class HspRun(BaselineRun):
+    """A run of HSP."""
+
+    method: Literal["hsp"] = "hsp"
+    """Pairs of a biased agent and its partner, the most different of a pool."""
+    hsp: HspConfig = HspConfig()
+    """Utilities, pool and choice."""
+
+
+class BpRun(BaselineRun):
+    """A run that makes ZSC-Eval's behaviour-preferring partners."""
+
+    method: Literal["bp"] = "bp"
+    """The same pairs, chosen for what their partners, the best responses, have to do."""
+    hsp: HspConfig = HspConfig()
+    """Utilities, pool and choice."""
+
+
 class PartnerRun(BaselineRun):
     """What the runs of baselines that meet partners have."""
 

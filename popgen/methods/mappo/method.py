@@ -1,17 +1,37 @@
 """The baselines on RLlib's MAPPO as the rest of the house knows them."""
 
-from popgen.methods.mappo.config import ComediRun, FcpRun, LipoRun, MappoRun, MepRun, TrajediRun
+from popgen.methods.mappo.config import (
+    BpRun,
+    ComediRun,
+    E3tRun,
+    FcpRun,
+    HspRun,
+    LipoRun,
+    MappoRun,
+    MepRun,
+    TrajediRun,
+)
 from popgen.methods.mappo.needs import (
     check_comedi,
     check_fcp,
+    check_hsp,
     check_view,
     estimate_comedi,
+    estimate_hsp,
     estimate_lipo,
     estimate_mappo,
     estimate_together,
     list_actors,
 )
-from popgen.methods.mappo.recipes import COMEDI_OBJECTIVES, COMEDI_RECIPES, LIPO_OBJECTIVES, LIPO_RECIPES, RECIPES
+from popgen.methods.mappo.recipes import (
+    BP_RECIPES,
+    COMEDI_OBJECTIVES,
+    COMEDI_RECIPES,
+    HSP_RECIPES,
+    LIPO_OBJECTIVES,
+    LIPO_RECIPES,
+    RECIPES,
+)
 from popgen.methods.method import Method
 
 MAPPO = Method(
@@ -97,5 +117,47 @@ TRAJEDI = Method(
     training="popgen.methods.mappo.trajedi:open_training",
     actors=list_actors,
     needs=estimate_together,
+    check=check_view,
+)
+
+HSP = Method(
+    name="hsp",
+    title="HSP",
+    summary="Pairs of an agent with a hidden utility and its partner, the most different of a pool, on RLlib's MAPPO.",
+    colour="#332288",
+    marker="D",
+    config=HspRun,
+    recipes=HSP_RECIPES,
+    training="popgen.methods.mappo.hsp:open_training",
+    actors=list_actors,
+    needs=estimate_hsp,
+    check=check_hsp,
+)
+
+BP = Method(
+    name="bp",
+    title="BP",
+    summary="Behaviour-preferring partners and their best responses, chosen by BR-Div, on RLlib's MAPPO.",
+    colour="#117733",
+    marker="d",
+    config=BpRun,
+    recipes=BP_RECIPES,
+    training="popgen.methods.mappo.hsp:open_training",
+    actors=list_actors,
+    needs=estimate_hsp,
+    check=check_hsp,
+)
+
+E3T = Method(
+    name="e3t",
+    title="E3T",
+    summary="Play beside the own policy mixed with chance: members that differ by their seeds, on RLlib's MAPPO.",
+    colour="#882255",
+    marker="*",
+    config=E3tRun,
+    recipes=RECIPES,
+    training="popgen.methods.mappo.e3t:open_training",
+    actors=list_actors,
+    needs=estimate_mappo,
     check=check_view,
 )

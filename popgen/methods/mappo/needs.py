@@ -9,9 +9,9 @@ import numpy as np
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, count_numbers
-from popgen.methods.mappo.config import BaselineRun, ComediRun, FcpRun, LipoRun, PpoConfig
+from popgen.methods.mappo.config import BaselineRun, BpRun, ComediRun, FcpRun, HspConfig, HspRun, LipoRun, PpoConfig
 from popgen.methods.method import ActorDemand, Needs, ask_for
-from popgen.types import FINAL_SKILL
+from popgen.types import BIASED_ROLE, FINAL_SKILL, PARTNER_ROLE
 
 SKILLS = ("initial", "half", FINAL_SKILL)
 """Of the members of a seed of FCP, in order."""
@@ -49,6 +49,34 @@ def estimate_comedi(config: ComediRun, spec: EnvSpec) -> Needs:
     environments = config.ppo.envs + partners * (diversity.xp_envs + mixed)
     fresh = 2 * diversity.select_episodes * partners
     return _estimate(config, spec, critics=1 + 2 * partners, environments=environments, fresh=fresh)
+
+
+def roles_of(hsp: HspConfig) -> tuple[str, ...]:
+    """Of the members that a chosen pair gives, in order."""
+    return {"both": (BIASED_ROLE, PARTNER_ROLE), "biased": (BIASED_ROLE,), "partners": (PARTNER_ROLE,)}[hsp.members]
+
+
+def estimate_hsp(config: HspRun | BpRun, spec: EnvSpec) -> Needs:
+    """Bytes of all pairs at once, two policies each."""
+    pool = config.hsp.pool
+    return _estimate(config, spec, critics=1, environments=pool * config.ppo.envs, together=2 * pool)
+
+
+def check_hsp(config: HspRun | BpRun, spec: EnvSpec) -> None:
+    """The view, whole pairs, and a pool that has as many.
+
+    Raises:
+        UserError: a view that the environment does not have, half a pair, or more pairs than are trained.
+    """
+    check_view(config, spec)
+    size, each = config.population.size, len(roles_of(config.hsp))
+    if size % each:
+        problem = f"{size} is no multiple of {each}: each pair gives a biased agent and its partner"
+        raise UserError("population.size", problem, f"set it to {size + 1}")
+    if size // each > config.hsp.pool:
+        raise UserError("hsp.pool", f"is {config.hsp.pool}, of which {size // each} are to be chosen", "raise it")
+    if config.ppo.envs < 2:
+        raise UserError("ppo.envs", "a pair plays in two seatings", "set it to at least 2")
 
 
 def _estimate(

@@ -39,12 +39,14 @@ class Objective:
             played for that alone; otherwise by the episodes of training, which then has cross-play with every partner.
         together: all members learn together, though they never meet.
         bonus: a reward beside the environment's, by what the other members that learn would do.
+        noise: share of random actions of whoever has the other seat, which is the member itself; 0: plain self-play.
     """
 
     terms: tuple[Term, ...] = ()
     fresh_episodes: bool = False
     together: bool = False
     bonus: PopulationBonus | None = None
+    noise: float = 0.0
 
     @property
     def meets_partners(self) -> bool:

@@ -18,6 +18,9 @@ from popgen.play.matches import Match
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength, any_then_strongest
 from popgen.types import Kind
 
+HABIT_DECAY = 0.9
+"""Per iteration, of the moving mean of what players do."""
+
 
 @dataclass(frozen=True)
 class Counted:
@@ -48,8 +51,9 @@ class PlayRecord:
         self.partners = {m: PartnerStrength("max_latest", window) for m in job.learning}
         limit, step = (None, 0.0) if job.diversity is None else (job.diversity.xp_limit, job.diversity.multiplier_step)
         self.constraints = {m: PartnerConstraint(limit, step) for m in job.learning}
-        self.own: dict[int, deque[float]] = {m: deque(maxlen=job.ppo.window) for m in job.learning}
-        self.taken = dict.fromkeys(job.learning, 0)  # self-play steps
+        self.own: dict[int, deque[float]] = {m: deque(maxlen=job.ppo.window) for m in job.owners}
+        self.taken = dict.fromkeys(job.owners, 0)  # self-play steps
+        self.habits: dict[int, np.ndarray] = {}  # moving mean of each player's events of a step, in its own play
         self.rng = np.random.default_rng(job.seed)
 
     @property
@@ -60,11 +64,12 @@ class PlayRecord:
     @property
     def finished(self) -> bool:
         """The budget is used up, or every member's targets are reached."""
-        return self.progress >= 1.0 or all(self.is_target_reached(member) for member in self.job.learning)
+        return self.progress >= 1.0 or all(self.is_target_reached(member) for member in self.job.owners)
 
     def scores(self, member: int) -> dict[str, float]:
         """Mean scores of the latest episodes: `sp`, and `xp` of the partner with the highest."""
-        own = {"sp": float(np.mean(self.own[member]))} if self.own[member] else {}
+        scores = self.own[self.job.owner_of(member)]
+        own = {"sp": float(np.mean(scores))} if scores else {}
         cross = self.partners[member].mean_scores()
         return own | ({"xp": max(cross.values())} if cross else {})
 
@@ -82,9 +87,9 @@ class PlayRecord:
     def plan(self, member: int, rounds: int) -> Plan:
         """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`. The partner
         is the strongest or, under a constraint, drawn in proportion to the multipliers."""
-        diversity, partners = self.job.diversity, self.job.partners(member)
+        diversity, partners, mate = self.job.diversity, self.job.partners(member), self.job.mate_of(member)
         if diversity is None or not partners:
-            return Plan()
+            return Plan(mate=None if mate == member else mate)
         weight = linear(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
         if diversity.xp_limit is None:
             strength = self.partners[member].scores()
@@ -115,6 +120,7 @@ class PlayRecord:
             totals[match.owner, match.kind].steps += played
             if match.kind is Kind.SP:
                 self.taken[match.owner] += played
+        self._add_habits(rollout)
         for episode in rollout.episodes:
             total = totals[episode.owner, episode.kind]
             total.episodes += 1
@@ -128,6 +134,17 @@ class PlayRecord:
             Counted(runner, owner, kind, total.steps, total.episodes, total.score)
             for (owner, kind), total in totals.items()
         ]
+
+    def _add_habits(self, rollout: Rollout) -> None:
+        """A tenth of the moving mean is what each player did in these steps."""
+        if not rollout.events.shape[-1]:
+            return
+        for member in self.job.learning:
+            own = rollout.seats == member
+            if not own.any():
+                continue
+            now = rollout.events[own].mean(0, dtype=np.float64)
+            self.habits[member] = self.habits.get(member, now) * HABIT_DECAY + (1.0 - HABIT_DECAY) * now
 
     def selection_matches(self, member: int, diversity: DiversityConfig) -> Sequence[Match]:
         """Fresh episodes with every partner, in both seatings, decide who is the strongest; the old ones are
@@ -147,6 +164,7 @@ class PlayRecord:
             "constraints": {str(m): constraint.state() for m, constraint in self.constraints.items()},
             "own": {str(m): list(scores) for m, scores in self.own.items()},
             "taken": {str(m): steps for m, steps in self.taken.items()},
+            "habits": {str(m): habits.copy() for m, habits in self.habits.items()},
             "rng": self.rng.bit_generator.state,
         }
 
@@ -155,7 +173,9 @@ class PlayRecord:
         for member in self.job.learning:
             self.partners[member].load_state(state["partners"][str(member)])
             self.constraints[member].load_state(state["constraints"][str(member)])
+        for member in self.job.owners:
             self.own[member].clear()
             self.own[member].extend(state["own"][str(member)])
             self.taken[member] = int(state["taken"][str(member)])
+        self.habits = {int(m): np.array(habits) for m, habits in state["habits"].items()}
         self.rng.bit_generator.state = state["rng"]

@@ -83,6 +83,7 @@ class PooledLearner(PPOTorchLearner):
                 lam=ppo.lam,
                 value_decay=ppo.value_decay,
                 bonus=self._bonus_of(member),
+                utility=self.config.job.utilities.get(member),
             )
             if batch is not None:
                 batches[member] = batch.to(self._device)

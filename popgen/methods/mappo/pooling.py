@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from popgen.envs.contract import ViewSpec
 from popgen.losses.policy_losses import bound_advantage, signed_advantage
+from popgen.methods.mappo.hidden_utility import Utility
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import critic_name
 from popgen.nets.feed_forward import ValueNet, joint
@@ -31,16 +32,18 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class Plan:
-    """What a member is trained on in one iteration: self-play, and cross-play and mixed play with one partner."""
+    """What a member is trained on in one iteration: its own play, and cross-play and mixed play with one partner. Its
+    own play is with itself unless `mate` has the other seat."""
 
     partner: int | None = None
     lambda_xp: float = 0.0
     lambda_mp: float = 0.0
     xp_clip: float = 0.0
+    mate: int | None = None
 
     def sources(self, member: int) -> list[tuple[Kind, int, float]]:
         """(kind, partner, weight), self-play first."""
-        sources = [(Kind.SP, member, 1.0)]
+        sources = [(Kind.SP, member if self.mate is None else self.mate, 1.0)]
         if self.partner is not None:
             sources += [(Kind.XP, self.partner, self.lambda_xp), (Kind.MP, self.partner, self.lambda_mp)]
         return [source for source in sources if source[2] > 0.0]
@@ -53,12 +56,14 @@ class MemberTrajectories:
     Attributes:
         steps: the trajectories.
         trained: (T, n, P) bool, the seat was played by the member's present policy and counts.
-        seat: (n,) int64, which seat of cross-play the member has; 0 where it has both.
+        seat: (n,) int64, which seat of cross-play or of a pair the member has; 0 where it has both.
+        events: (T, n, F), what the member did in its seats; F = 0 where nobody counted.
     """
 
     steps: Trajectories
     trained: Tensor
     seat: Tensor
+    events: Tensor
 
 
 def gather(rollouts: Sequence[Rollout], kind: Kind, member: int, partner: int) -> MemberTrajectories | None:
@@ -72,8 +77,8 @@ def gather(rollouts: Sequence[Rollout], kind: Kind, member: int, partner: int) -
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts], _SIDE.get(name, 1)) for name in parts[0]}
-    trained, seat = joined.pop("trained"), joined.pop("seat")
-    return MemberTrajectories(Trajectories(**joined), trained, seat)
+    trained, seat, events = joined.pop("trained"), joined.pop("seat"), joined.pop("events")
+    return MemberTrajectories(Trajectories(**joined), trained, seat, events)
 
 
 _SIDE = {"cut_at": 0, "cut_obs": 0, "seat": 0}
@@ -83,11 +88,12 @@ def _columns_of_match(rollout: Rollout, index: int, member: int, offset: int) ->
     """One match's columns, which come to stand at `offset`, as tensors."""
     match, columns = rollout.matches[index], rollout.columns(index)
     own = rollout.seats[:, columns] == member
-    if match.kind is not Kind.XP:  # mixed play counts from the switch on, when the member has both seats
+    if match.kind is Kind.MP:  # it counts from the switch on, when the member has both seats
         own = np.broadcast_to(own.all(-1, keepdims=True), own.shape)
     inside = (rollout.cut_at[:, 1] >= columns.start) & (rollout.cut_at[:, 1] < columns.stop)
     cut_at = rollout.cut_at[inside] - np.array([0, columns.start - offset])
-    seat = match.members.index(member) if match.kind is Kind.XP else 0
+    seat = 0 if match.kind is Kind.MP else match.members.index(member)
+    did = np.where(own[..., None], rollout.events[:, columns], 0).sum(2, dtype=np.float32)
     arrays = {
         "obs": rollout.obs[:, columns],
         "cut_at": cut_at,
@@ -98,6 +104,7 @@ def _columns_of_match(rollout: Rollout, index: int, member: int, offset: int) ->
         "terminated": rollout.terminated[:, columns],
         "cut": rollout.truncated[:, columns],
         "trained": own,
+        "events": did,
         "seat": np.full(match.envs, seat),
     }
     return {name: torch.from_numpy(np.require(array, requirements=["C", "W"])) for name, array in arrays.items()}
@@ -197,10 +204,10 @@ def pool(
     lam: float,
     value_decay: float,
     bonus: Callable[[Trajectories], Tensor] | None = None,
+    utility: Utility | None = None,
 ) -> PooledBatch | None:
-    """One member's batch; None where it played no self-play (a runner was lost).
-
-    Each critic takes its returns into its statistics. `bonus` gives a reward (T, N) on top of self-play's.
+    """One member's batch; None where it played no self-play (a runner was lost). Each critic takes its returns into its
+    statistics. `utility` pays in the reward's place, `bonus` (T, N) on top.
     """
     own, parts, rows, figures = None, [], {}, {}
     for kind, partner, weight in plan.sources(member):
@@ -209,8 +216,8 @@ def pool(
             continue
         counted, label = played.trained.any(-1), str(kind).lower()
         figures[f"{label}_reward"] = float(played.steps.reward[counted].mean())
-        if kind is Kind.SP and bonus is not None:
-            played = _add_bonus(played, bonus(played.steps), figures)
+        if kind is Kind.SP:
+            played = _change_reward(played, utility, bonus, figures)
         critic = critics[name]
         assert isinstance(critic, ValueNet)
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
@@ -238,10 +245,22 @@ def pool(
     return PooledBatch(**joined, critics=rows, figures=figures)
 
 
-def _add_bonus(played: MemberTrajectories, bonus: Tensor, figures: dict[str, float]) -> MemberTrajectories:
-    """The same trajectories with a richer reward."""
-    figures["bonus"] = float(bonus.mean())
-    return replace(played, steps=replace(played.steps, reward=played.steps.reward + bonus))
+def _change_reward(
+    played: MemberTrajectories,
+    utility: Utility | None,
+    bonus: Callable[[Trajectories], Tensor] | None,
+    figures: dict[str, float],
+) -> MemberTrajectories:
+    """The same trajectories, paid by a utility and with a bonus, where there are these."""
+    reward = played.steps.reward
+    if utility is not None:
+        reward = utility.pay(reward, played.events)
+        figures["utility"] = float(reward.mean())
+    if bonus is not None:
+        extra = bonus(played.steps)
+        figures["bonus"] = float(extra.mean())
+        reward = reward + extra
+    return replace(played, steps=replace(played.steps, reward=reward))
 
 
 def _policy_rows(played: MemberTrajectories, advantage: Tensor, kind: Kind) -> dict[str, Tensor]:

@@ -136,6 +136,23 @@ def _with_diversity(own: Settings) -> dict[str, Recipe]:
     }
 
 
+def _with_pairs(own: Settings) -> dict[str, Recipe]:
+    """MAPPO's recipes for pools of pairs: an even population where the schema's size is none."""
+    small = {"smoke": {"hsp.pool": 2}, "demo": {"hsp.pool": 2}}
+    return {
+        base.name: Recipe(
+            base.name,
+            base.summary,
+            {"population.size": _PAIRED[base.name], **own, **small.get(base.name, {})},
+            base=base,
+        )
+        for base in RECIPES.values()
+    }
+
+
+_PAIRED = {"laptop": 8, "demo": 2, "paper": 8, "smoke": 2}
+"""Members, two of a pair."""
+
 RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}
 
 
@@ -162,3 +179,7 @@ COMEDI_RECIPES = _with_diversity(
 
 LIPO_OBJECTIVES, COMEDI_OBJECTIVES = _objectives(0.25), _objectives(0.5)
 """Rows of the table of self-sabotage."""
+
+HSP_RECIPES = _with_pairs({"hsp.select": because("events", "the paper's: the biased agents do different things")})
+
+BP_RECIPES = _with_pairs({"hsp.select": because("responses", "ZSC-Eval's: their best responses do different things")})

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from popgen.envs.contract import BatchedEnv
+from popgen.envs.player_events import count_player_events, name_player_events
 from popgen.envs.reward import training_reward
 from popgen.nets.blocks import DrawnActions, draw_by_gumbel
 from popgen.play.episodes import Episode
@@ -36,6 +37,7 @@ class Rollout:
         terminated, truncated: (T, N) bool.
         seats: (T, N, P) int32, the member who acted.
         episodes: those that ended, in order.
+        events: (T, N, P, F) uint8, what each player did (`popgen.envs.player_events`); F = 0 where nobody asked.
     """
 
     matches: tuple[Match, ...]
@@ -49,6 +51,7 @@ class Rollout:
     truncated: np.ndarray
     seats: np.ndarray
     episodes: tuple[Episode, ...]
+    events: np.ndarray
 
     @property
     def steps(self) -> int:
@@ -74,6 +77,7 @@ class SlotPool:
         stagger: spread the first ends of episodes over the horizon.
         once: tell of the first episode of every environment alone. Of all that end within a given time, short ones are
             more than their share.
+        events: count what each player does.
     """
 
     def __init__(
@@ -85,8 +89,9 @@ class SlotPool:
         seed: int,
         stagger: bool = True,
         once: bool = False,
+        events: bool = False,
     ) -> None:
-        self.make, self.matches, self.view, self.once = make, tuple(matches), view, once
+        self.make, self.matches, self.view, self.once, self.events = make, tuple(matches), view, once, events
         self._envs: dict[int, BatchedEnv] = {}
         self._rng = np.random.default_rng(seed)
         self._draws = torch.Generator().manual_seed(seed)
@@ -181,6 +186,8 @@ class _SlotRun:
         self.seats = np.empty(self.actions.shape, np.int32)
         self.rewards = np.empty((steps, count), np.float32)
         self.terminated, self.truncated = np.empty((steps, count), bool), np.empty((steps, count), bool)
+        kinds = len(name_player_events(self.env)) if pool.events else 0
+        self.events = np.zeros((*self.actions.shape, kinds), np.uint8)
         self.cut_at: list[np.ndarray] = []
         self.cut_obs: list[np.ndarray] = []
         self.episodes: list[Episode] = []
@@ -205,7 +212,10 @@ class _SlotRun:
         self.seats[t] = self.now
         self.actions[t] = actions.view(self.now.shape).numpy()
         self.log_prob[t] = log_prob.view(self.now.shape).numpy()
+        states = self.env.get_state() if self.pool.events else None
         result = self.env.step(self.actions[t])
+        if states is not None:
+            self.events[t] = count_player_events(self.env, states, self.actions[t], result)
         self.rewards[t] = training_reward(self.pool.spec, result)
         self.terminated[t], self.truncated[t] = result.terminated, result.truncated
         self.score += result.score
@@ -264,4 +274,5 @@ class _SlotRun:
             truncated=self.truncated,
             seats=self.seats,
             episodes=tuple(self.episodes),
+            events=self.events,
         )

@@ -92,6 +92,8 @@ def training_job(
         mixed=diversity is not None and objective.samples(Kind.MP, diversity),
         fresh=objective.fresh_episodes,
         bonus=objective.bonus,
+        pairs={member: -member for member in learning} if objective.noise > 0.0 else {},
+        noise=objective.noise,
     )
 
 
@@ -156,8 +158,9 @@ class RllibTraining:
         counts: list[StepCount] = []
         for number, one in enumerate(report.counted, now.sequence):
             name = f"runner{one.runner}.{self.attempt}"
-            counts.append(StepCount(one.owner, one.kind, name, number, one.steps, one.episodes, one.score))
-            now.steps[one.owner] += one.steps
+            member = self.member_of(one.owner)
+            counts.append(StepCount(member, one.kind, name, number, one.steps, one.episodes, one.score))
+            now.steps[member] += one.steps
         now.sequence += len(counts)
         first = self.learning[0]
         yield Progress(first, now.steps[first], counted=tuple(counts))
@@ -165,16 +168,23 @@ class RllibTraining:
             text = f"runner {runner} was lost: its environments are missing until Ray has restarted it"
             yield Progress(first, now.steps[first], note=text)
         update_ms = 1000.0 * report.seconds["learning"] / (ppo.epochs * ppo.minibatches)
-        for member in self.learning:
-            figures = report.figures[member]
+        for member, figures in self.figures_by_member().items():
             shown = {f"real_{name}" if name in SCORES else f"ppo/{name}": value for name, value in figures.items()}
             shown |= {"ppo/update_ms": update_ms, "iteration": self.algorithm.rounds}
             yield Progress(member, now.steps[member], shown)
 
+    def member_of(self, trained: int) -> int:
+        """For which member the steps of one of RLlib's policies count."""
+        return trained
+
+    def figures_by_member(self) -> dict[int, dict[str, float]]:
+        """The last iteration's, of the members that learn."""
+        return {member: self.algorithm.report.figures[member] for member in self.learning}
+
     def _end_round(self) -> Round:
         """The last iteration is kept in any case: members are added one after the other, which may be interrupted."""
         algorithm, steps = self.algorithm, self.progress.steps
-        scores = [algorithm.scores(member) for member in self.learning]
+        scores = [algorithm.scores(member) for member in algorithm.job.owners]
         by_name = {name.upper(): [score[name] for score in scores if name in score] for name in SCORES}
         means = {name: round(sum(values) / len(values), 2) for name, values in by_name.items() if values}
         return Round(
@@ -191,12 +201,13 @@ class RllibTraining:
         for member in self.learning:
             yield self.finish_member(member)
 
-    def finish_member(self, member: int) -> TrainedMember:
-        """The actor as it is saved, its critics beside it."""
+    def finish_member(self, member: int, trained: int | None = None) -> TrainedMember:
+        """The actor as it is saved, its critics beside it; `trained` is its number in RLlib, where that is another."""
         algorithm, seconds = self.algorithm, self._count_seconds()
-        policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), algorithm.actors()[member], self.spec)
+        number = member if trained is None else trained
+        policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), algorithm.actors()[number], self.spec)
         self.archive[member] = policy.weights()
-        scores = algorithm.scores(member)
+        scores = algorithm.scores(number)
         extra = {**scores, "iterations": algorithm.rounds, "seconds": round(seconds / len(self.learning), 1)}
         parts = ", ".join(f"{name.upper()} {value:.2f}" for name, value in scores.items())
         parts = f"{parts} {self.spec.score_name}" if parts else "no whole episode"
@@ -204,7 +215,7 @@ class RllibTraining:
         return TrainedMember(
             member,
             policy,
-            prefixed("critics", algorithm.critics(member)),
+            prefixed("critics", algorithm.critics(number)),
             seed=self.config.run.seed * 1000 + member,
             extra=extra,
             left={"sequence": self.progress.sequence},
@@ -246,10 +257,13 @@ class RllibTraining:
         check_card(self.config.cluster)
         self.learning = learning_members(self.objective, self.config, first)
         self.progress = GroupProgress(self.progress.sequence, steps=dict.fromkeys(self.learning, 0))
-        job = training_job(self.objective, self.config, self.learning, self.archive)
-        self._algorithm = build_algorithm(job, self.spec, self.config.cluster)
+        self._algorithm = build_algorithm(self.make_job(), self.spec, self.config.cluster)
         self.began = time.time()
         return self.learning
+
+    def make_job(self) -> Job:
+        """What RLlib is to train for the members that learn."""
+        return training_job(self.objective, self.config, self.learning, self.archive)
 
     def checkpoint(self) -> State:
         """See `Training`."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from popgen.config.sections import EnvConfig
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
+from popgen.methods.mappo.hidden_utility import Utility
 from popgen.methods.mappo.population_bonus import PopulationBonus
 from popgen.nets.feed_forward import Sizes
 from popgen.nets.weights import Weights
@@ -28,6 +29,10 @@ class Job:
         fresh: the strongest partner is matches by episodes of its own (CoMeDi), not by the training's.
         seed: of everything.
         bonus: added to self-play's reward.
+        pairs: learning member -> who has the other seat in its play, where that is not itself: another learning member,
+            or -m for the member's own policy with random actions among its own.
+        utilities: learning member -> what it is paid in the training reward's place.
+        noise: share of the random actions.
     """
 
     env: EnvConfig
@@ -39,6 +44,24 @@ class Job:
     mixed: bool = False
     fresh: bool = False
     bonus: PopulationBonus | None = None
+    pairs: Mapping[int, int] = field(default_factory=dict)
+    utilities: Mapping[int, Utility] = field(default_factory=dict)
+    noise: float = 0.0
+
+    @property
+    def owners(self) -> list[int]:
+        """Those of `learning` for whom their own play is sampled and counted: of a pair the first."""
+        others = set(self.pairs.values())
+        return [member for member in self.learning if member not in others]
+
+    def owner_of(self, member: int) -> int:
+        """For whom a member's own play is counted."""
+        return next((owner for owner, other in self.pairs.items() if other == member), member)
+
+    def mate_of(self, member: int) -> int:
+        """Who has the other seat in a member's own play: itself but for pairs."""
+        owner = self.owner_of(member)
+        return self.pairs.get(member, member) if owner == member else owner
 
     def partners(self, member: int) -> list[int]:
         """Whom a learning member meets in cross-play."""
@@ -52,7 +75,7 @@ class Job:
         Where two members learn together, their cross-play trains both; its steps are the later member's, as if it had
         been added to a population of the earlier ones.
         """
-        matches = [Match(Kind.SP, (m, m), self.ppo.envs, m) for m in self.learning]
+        matches = [match for member in self.owners for match in self._own_play(member)]
         if self.diversity is None:
             return matches
         half = self.diversity.xp_envs // 2
@@ -63,6 +86,14 @@ class Job:
         for k, m in pairs if self.mixed else []:
             matches += [Match(Kind.MP, (m, k), half, m), Match(Kind.MP, (k, m), half, m)]
         return matches
+
+    def _own_play(self, member: int) -> list[Match]:
+        """A member with itself, or its pair in both seatings."""
+        mate, envs = self.mate_of(member), self.ppo.envs
+        if mate == member:
+            return [Match(Kind.SP, (member, member), envs, member)]
+        seatings = ((member, mate), envs - envs // 2), ((mate, member), envs // 2)
+        return [Match(Kind.SP, members, count, member) for members, count in seatings]
 
     def critics(self, member: int) -> list[str]:
         """Names of a member's critics, one for each kind of trajectory and partner."""

@@ -1,0 +1,64 @@
+"""Diversity of event counts and the choice of the most different players, by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from popgen.play import event_diversity
+from popgen.play.event_diversity import choose_most_distant, choose_most_diverse, measure_diversity, measure_spread
+
+
+def test_br_div_of_orthogonal_and_of_equal_partners() -> None:
+    orthogonal = measure_diversity(np.eye(3) * 5)
+    scale = 5 / (5 + 1e-3)
+    assert orthogonal.determinant == pytest.approx(scale**6) and orthogonal.effective_rank == pytest.approx(3.0)
+    equal = measure_diversity(np.array([[1.0, 2.0], [1.0, 2.0]]))
+    assert equal.determinant == pytest.approx(0.0, abs=1e-12) and equal.effective_rank == pytest.approx(1.0)
+
+
+def test_the_effective_rank_of_two_eigenvalues() -> None:
+    """Columns 1 and 0.5: the Gram matrix of rows (1, 1) and (1, 0) has trace 3 and determinant 1, margins aside."""
+    diversity = measure_diversity(np.array([[1e6, 1e6], [1e6, 0.0]]))
+    values = np.array([(3 + math.sqrt(5)) / 2, (3 - math.sqrt(5)) / 2]) / 3
+    assert diversity.determinant == pytest.approx(1.0, rel=1e-6)
+    assert diversity.effective_rank == pytest.approx(math.exp(-(values * np.log(values)).sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("limit", [10**9, 0])
+def test_the_most_diverse_are_found_with_and_without_trying_all(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
+    events = np.abs(np.random.default_rng(3).normal(size=(9, 6)))
+    events[4] = events[2] * 1.001  # a near copy must not be chosen beside its model
+    everything = choose_most_diverse(events, 4)
+    monkeypatch.setattr(event_diversity, "EXHAUSTIVE", limit)
+    chosen = choose_most_diverse(events, 4)
+    assert chosen == everything == sorted(chosen) and not {2, 4} <= set(chosen)
+
+
+def test_the_most_distant_are_those_with_the_largest_sum_of_distances() -> None:
+    """Columns' maxima are 10 and 4: rows (0, 0), (1, 0), (.9, 0), (0, 1), (.5, .5). The first chosen is farthest from
+    all (sums 3.9, 4.1, 3.9, 4.9, 3.9 up to margins), the next ones farthest from those chosen."""
+    events = np.array([[0.0, 0.0], [10.0, 0.0], [9.0, 0.0], [0.0, 4.0], [5.0, 2.0]])
+    assert choose_most_distant(events, 1) == [3]
+    assert choose_most_distant(events, 2) == [1, 3]
+    assert choose_most_distant(events, 3) == [1, 2, 3]
+    assert choose_most_distant(events, 5) == [0, 1, 2, 3, 4]
+
+
+def test_spread_is_the_mean_distance_of_two() -> None:
+    """Distances of (0, 0), (1, 0), (1, 1): 1, 2 and 1."""
+    assert measure_spread(np.array([[0.0, 0.0], [2e6, 0.0], [2e6, 3e6]])) == pytest.approx(4 / 3, rel=1e-6)
+    assert measure_spread(np.ones((1, 2))) == 0.0
+
+
+def test_what_cannot_be_is_refused() -> None:
+    for call in (
+        lambda: measure_diversity(np.array([[-1.0]])),
+        lambda: choose_most_diverse(np.eye(3), 4),
+        lambda: choose_most_distant(np.eye(3), 4),
+        lambda: measure_spread(np.zeros((2, 0))),
+    ):
+        with pytest.raises(ValueError):
+            call()
