@@ -20,6 +20,7 @@ def add(commands: Any) -> None:
     kinds = study.add_subparsers(title="what to do", metavar="WHAT", required=True, parser_class=Parser)
     _add_init(kinds)
     _add_serve(kinds)
+    _add_simulate(kinds)
     verify = add_command(
         kinds,
         "verify",
@@ -29,6 +30,17 @@ def add(commands: Any) -> None:
         "code 2 where a recording is not proven. Keys of --json: games, proven, steps, problems.",
     )
     verify.add_argument("study", metavar="STUDY")
+    export = add_command(
+        kinds,
+        "export",
+        export_records,
+        "write records as tables",
+        "steps (the 14 columns of the field's public data, then ours), games, participants, answers; completion codes "
+        "apart. `popgen conventions --records OUT/steps.parquet` reads the steps. Keys of --json: files, games, steps.",
+    )
+    export.add_argument("study", metavar="STUDY")
+    export.add_argument("--out", metavar="DIR", default=None, help="STUDY/export by default")
+    export.add_argument("--format", choices=("parquet", "csv"), default="parquet", help="of the steps (%(default)s)")
     balance = add_command(
         kinds,
         "balance",
@@ -59,6 +71,28 @@ def _add_init(kinds: Any) -> None:
     init.add_argument("--tutorials", type=at_least(0), default=3, help="practice games (%(default)s)")
     init.add_argument("--pairs", type=at_least(1), default=2, help="of games in each layout (%(default)s)")
     init.add_argument("--steps", type=at_least(1), default=400, help="of a game (%(default)s)")
+
+
+def _add_simulate(kinds: Any) -> None:
+    simulate = add_command(
+        kinds,
+        "simulate",
+        simulate_study,
+        "let members take part, through the real requests and connections",
+        "Their records lie in STUDY beside any others: use a study made for it. Without --agent keys are pressed at "
+        "random. Keys of --json: seconds, statuses, games, steps, breaks, most_lost, kills, lateness (steps, median, "
+        "p99, most in milliseconds, missed).",
+    )
+    simulate.add_argument("study", metavar="STUDY")
+    simulate.add_argument("--agent", action="append", default=[], metavar="POPULATION", help="members take part")
+    simulate.add_argument("--participants", type=at_least(1), default=20, help="in all (%(default)s)")
+    simulate.add_argument("--together", type=at_least(1), default=20, help="at once (%(default)s)")
+    simulate.add_argument("--games", type=at_least(1), default=None, help="of each (all)")
+    simulate.add_argument(
+        "--speed", type=at_least(0), default=0, help="times real time; 0: as fast as they answer (%(default)s)"
+    )
+    simulate.add_argument("--kills", type=at_least(0), default=0, help="of the server, by SIGKILL (%(default)s)")
+    simulate.add_argument("--seed", type=at_least(0), default=0, help="of participants and kills (%(default)s)")
 
 
 def _add_serve(kinds: Any) -> None:
@@ -137,6 +171,50 @@ def serve_study_pages(args: argparse.Namespace) -> int:
     return OK
 
 
+def simulate_study(args: argparse.Namespace) -> int:
+    """Serve in a process and take part."""
+    bound_threads(1)
+    from dataclasses import asdict
+
+    from popgen.population import load_population
+    from popgen.study.simulated_participants import Casting
+    from popgen.study.study_definition import read_study
+    from popgen.study.study_dry_run import DryRunPlan, run_dry, summarize_visits
+
+    study = read_study(args.study)
+    casting = Casting(study, [load_population(path) for path in args.agent])
+    plan = DryRunPlan(
+        participants=args.participants,
+        together=args.together,
+        speed=args.speed,
+        games=args.games,
+        kills=args.kills,
+        seed=args.seed,
+    )
+
+    def tell(done: int) -> None:
+        if not args.quiet:
+            print(f"{done} of {args.participants} participants are through", file=sys.stderr, flush=True)
+
+    found = run_dry(study, casting, plan, tell)
+    told = summarize_visits(found.visits)
+    if args.json:
+        print_json({"seconds": found.seconds, **told, "kills": found.kills, "lateness": asdict(found.lateness)})
+        return OK
+    statuses = ", ".join(f"{count} {status}" for status, count in told["statuses"].items())
+    print(f"{statuses}; {told['games']} games, {told['steps']:,} steps in {found.seconds:.0f} s")
+    late = found.lateness
+    if args.speed:
+        print(
+            f"late by {late.median:.2f} ms (median), {late.p99:.2f} (p99), {late.most:.2f} (most); {late.missed} missed"
+        )
+    if found.kills:
+        print(
+            f"{found.kills} kills, {told['breaks']} connections broke, {told['most_lost']} steps lost at most at once"
+        )
+    return OK
+
+
 def _listen(host: str, port: int) -> socket.socket:
     listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -167,6 +245,23 @@ def verify_study(args: argparse.Namespace) -> int:
         for one in wrong:
             print(f"game {one.game}: {one.problem}")
     return ERROR if wrong else OK
+
+
+def export_records(args: argparse.Namespace) -> int:
+    """Write the tables."""
+    from popgen.study.study_definition import read_study
+    from popgen.study.study_export import export_study
+    from popgen.study.study_tables import Database
+
+    study = read_study(args.study)
+    out = Path(args.out) if args.out else study.folder / "export"
+    written = export_study(study, Database(study.database), out, args.format)
+    if args.json:
+        files = [str(file) for file in written.files]
+        print_json({"files": files, "games": written.games, "steps": written.steps})
+        return OK
+    print(f"{written.games} games, {written.steps:,} steps: {out} ({', '.join(file.name for file in written.files)})")
+    return OK
 
 
 def show_balance(args: argparse.Namespace) -> int:

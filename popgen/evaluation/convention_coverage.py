@@ -42,7 +42,7 @@ def measure_coverage(
     """
     if not people or not members:
         raise ValueError("people and members: both need games")
-    rates = np.concatenate([game.rates for game in people])
+    rates = np.concatenate([game.rates[np.array(game.judged, bool)] for game in people])
     used = rates.std(0) > 0
     centre, scale = rates[:, used].mean(0), np.maximum(rates[:, used].std(0), LEAST_SPREAD)
     points = (rates[:, used] - centre) / scale

@@ -99,11 +99,12 @@ def collect_samples(
         rates = np.where(both > 0, rates / np.where(both > 0, both, 1.0), 0.5)
     names = [name for game in games for name in game.participants]
     strata = [f"{game.layout} {seat}" for game in games for seat in (0, 1)]
+    judged = np.array([game.judged for game in games], bool).reshape(-1)
     return Samples(
-        rates.reshape(-1, len(columns)),
-        np.repeat([game.dish_rate for game in games], 2),
-        np.unique(names, return_inverse=True)[1],
-        np.unique(strata, return_inverse=True)[1],
+        rates.reshape(-1, len(columns))[judged],
+        np.repeat([game.dish_rate for game in games], 2)[judged],
+        np.unique(np.array(names)[judged], return_inverse=True)[1],
+        np.unique(np.array(strata)[judged], return_inverse=True)[1],
     )
 
 
@@ -164,5 +165,7 @@ def tabulate_effects(games: Sequence[PlayedGame], threshold: float, *, pooled: b
         samples = collect_samples(games, shares=shares)
         names = [f"{name} (share)" if shares else name for name in BEHAVIOURS]
         found = measure_effects(samples if pooled else samples.within_strata(), names, threshold)
-        effects += [replace(one, group="uneven") for one in found if one.group == "high"] if shares else found
+        if shares and all(all(game.judged) for game in games):
+            found = [replace(one, group="uneven") for one in found if one.group == "high"]
+        effects += found
     return correct_by_holm(effects)

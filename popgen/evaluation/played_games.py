@@ -11,6 +11,7 @@ from popgen.envs.overcooked.env import OvercookedEnv
 from popgen.envs.overcooked.transition_events import EVENTS, find_transition_events
 from popgen.errors import UserError
 from popgen.humans.behaviour import STEPS
+from popgen.humans.record_tables import TableGame
 from popgen.humans.recordings import HumanGame, make_human_env
 from popgen.play.rollout import Transition, play
 from popgen.population.store import Population
@@ -25,6 +26,7 @@ class PlayedGame(NamedTuple):
         steps: of the game.
         dishes: of the team.
         counts: (2, len(EVENTS)) float64, each player's events.
+        judged: whose play is to be judged, by seat: of a person and an ego the person's alone.
     """
 
     layout: str
@@ -32,6 +34,7 @@ class PlayedGame(NamedTuple):
     steps: int
     dishes: float
     counts: np.ndarray
+    judged: tuple[bool, bool] = (True, True)
 
     @property
     def rates(self) -> np.ndarray:
@@ -53,6 +56,20 @@ def count_people(games: Sequence[HumanGame]) -> list[PlayedGame]:
         pair = f"{game.half} pair {game.pair}"
         played.append(PlayedGame(game.layout, (pair, pair), game.steps, float(game.dishes.sum()), counts))
     return played
+
+
+def count_table_games(games: Sequence[TableGame]) -> dict[str, list[PlayedGame]]:
+    """Finished games of a table by whom people played with: `people`, or `people with` the other player's name."""
+    found: dict[str, list[PlayedGame]] = {}
+    for game in games:
+        if not any(game.people) or not game.finished:
+            continue
+        label = "people" if all(game.people) else f"people with {game.players[game.people.index(False)]}"
+        counts = find_transition_events(game.env, game.states, game.actions).sum(0, dtype=np.float64)
+        names = (" and ".join(game.players),) * 2 if all(game.people) else game.players
+        played = PlayedGame(game.layout, names, len(game.actions), float(game.dishes.sum()), counts, game.people)
+        found.setdefault(label, []).append(played)
+    return found
 
 
 def count_members(population: Population, episodes: int, seed: int) -> list[PlayedGame]:
