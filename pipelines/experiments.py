@@ -33,7 +33,16 @@ class Source:
 
 
 @dataclass(frozen=True)
-class _Measured:
+class Measured:
+    """A population and who leaves in it.
+
+    Attributes:
+        source: what was measured.
+        termination: by which an exit is paid in training.
+        own: as in training.
+        other: rule -> the same play paid by it.
+    """
+
     source: Source
     termination: str
     own: SabotageResult
@@ -41,6 +50,7 @@ class _Measured:
 
     @property
     def name(self) -> str:
+        """On tables."""
         return title_of(self.source.label)
 
     @property
@@ -122,14 +132,14 @@ def self_sabotage(
     reporter.phase("self-sabotage", len(opened))
     measured = []
     for number, source in enumerate(opened, start=1):
-        measured.append(_measure_source(source, episodes, seed))
+        measured.append(measure_source(source, episodes, seed))
         reporter.update(number, population=source.label)
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         steps = _record_steps(folder, measured)
         report = build_report(
-            measured[0].own.environment, episodes, seed, steps, [_describe_population(one) for one in measured]
+            measured[0].own.environment, episodes, seed, steps, [describe_population(one) for one in measured]
         )
         files = _write_texts(folder, report) | _draw_paths(folder, measured)
     except OSError as error:
@@ -137,16 +147,16 @@ def self_sabotage(
     return report | {"files": {name: str(path) for name, path in files.items()}}
 
 
-def _measure_source(source: Source, episodes: int, seed: int) -> _Measured:
+def measure_source(source: Source, episodes: int, seed: int) -> Measured:
     """In the environment of its training, and the same play paid by the other rule."""
     termination = termination_of(source.population.env_info.params)
     own = measure_sabotage(source.population, episodes, seed)
     others = {name: rule for name, rule in TERMINATIONS.items() if termination and name != termination}
     other = {name: measure_sabotage(source.population, episodes, seed, rule) for name, rule in others.items()}
-    return _Measured(source, termination, own, other)
+    return Measured(source, termination, own, other)
 
 
-def _record_steps(folder: Path, measured: Sequence[_Measured]) -> int:
+def _record_steps(folder: Path, measured: Sequence[Measured]) -> int:
     """Enter the evaluation in the experiment's own ledger; every call adds to it. Gives the steps of this call."""
     ledger = Ledger(folder / "ledger.jsonl")
     total = 0
@@ -170,7 +180,8 @@ def _record_steps(folder: Path, measured: Sequence[_Measured]) -> int:
     return total
 
 
-def _describe_population(one: _Measured) -> dict[str, Any]:
+def describe_population(one: Measured) -> dict[str, Any]:
+    """A row of `popgen.reports.sabotage_report`."""
     manifest, members = one.source.population.manifest, one.source.population.members
     figures = to_dict(one.own)
     results = {one.termination: one.own, **one.other} if one.termination else {}
@@ -201,7 +212,7 @@ def _write_texts(folder: Path, report: Mapping[str, Any]) -> dict[str, Path]:
     return {name: folder / name for name in texts}
 
 
-def _draw_paths(folder: Path, measured: Sequence[_Measured]) -> dict[str, Path]:
+def _draw_paths(folder: Path, measured: Sequence[Measured]) -> dict[str, Path]:
     """All pairs of each population, and for each rule of termination one pair of each population side by side."""
     pictures = Pictures(folder)
     samples: dict[str, list[PathSample]] = {}

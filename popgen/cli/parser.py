@@ -17,6 +17,7 @@ from popgen.cli import experiment_commands as experiments
 from popgen.cli import humans_commands as humans
 from popgen.cli import play_command as play
 from popgen.cli import population_commands as population
+from popgen.cli import reproduce_command as reproduction
 from popgen.cli import run_command as run
 from popgen.cli import study_commands as study
 from popgen.cli import sweep_command as sweep
@@ -60,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
     for subject in (
         *(run, sweep, configuration, evaluation, diversity, population, ego, play, comparison),
-        *(experiments, humans, conventions, study, bench),
+        *(experiments, reproduction, humans, conventions, study, bench),
     ):
         subject.add(commands)
     return parser

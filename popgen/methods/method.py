@@ -91,6 +91,7 @@ class Method:
         continuation: what a population to continue must have in common; None where the method cannot continue one.
         objectives: its rows in a table of self-sabotage: name -> settings on top of a recipe. A name means the same in
             every method: `self-play` (no partner), `paper` (the paper's objective) and `ours` (with our options).
+        multiple: its members come in so many at a time.
         trains_ego: its population of one is an ego agent, which plays with others.
     """
 
@@ -108,6 +109,7 @@ class Method:
     policies: Mapping[str, str] = field(default_factory=dict)
     continuation: Continuation | None = None
     objectives: Mapping[str, Settings] = field(default_factory=dict)
+    multiple: int = 1
     trains_ego: bool = False
 
     def load_training(self) -> OpenTraining:

@@ -12,6 +12,7 @@ from popgen.methods.mappo.config import (
     TrajediRun,
 )
 from popgen.methods.mappo.needs import (
+    SKILLS,
     check_comedi,
     check_fcp,
     check_hsp,
@@ -90,6 +91,7 @@ FCP = Method(
     actors=list_actors,
     needs=estimate_mappo,
     check=check_fcp,
+    multiple=len(SKILLS),
 )
 
 MEP = Method(

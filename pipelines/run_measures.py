@@ -1,0 +1,224 @@
+"""What `popgen reproduce` measures of a finished run: name -> small figures for its record."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from popgen.envs import make_env
+from popgen.errors import UserError
+from popgen.evaluation.convention_coverage import measure_coverage
+from popgen.evaluation.convention_effects import tabulate_effects
+from popgen.evaluation.crossplay import IDLE, RANDOM
+from popgen.evaluation.held_members import hold_members
+from popgen.evaluation.holdout import Casting, evaluate_holdout
+from popgen.evaluation.holdout_players import check_disjoint, open_sides
+from popgen.evaluation.partner_diversity import measure_partners
+from popgen.evaluation.played_games import count_members, count_people
+from popgen.humans.recordings import LAYOUTS, load_games
+from popgen.pipelines.compare import HELD_SEED
+from popgen.pipelines.experiments import describe_population, measure_source, open_sources
+from popgen.population import load_population
+from popgen.reports.comparison import default_thresholds, quality_costs
+from popgen.reports.holdout_report import to_dict
+from popgen.reports.method_titles import title_of
+from popgen.reports.run_record import MemberRecord, RunRecord, read_run
+from popgen.types import Kind
+
+SEED = 0
+"""Of evaluations; that of held ones is HELD_SEED."""
+
+GRID = 21
+"""Points of a curve that is kept."""
+
+SHARE = 0.8
+"""Of the final score, at which a curve has risen."""
+
+CONVENTION_SPREAD = 0.5
+"""Standard deviations from the mean at which the paper calls a convention high or low."""
+
+
+@dataclass(frozen=True)
+class RunToMeasure:
+    """A finished run, and what it is measured with.
+
+    Attributes:
+        folder: of the run.
+        row: what it is called.
+        episodes: of every evaluation.
+        holdouts: title -> folder of a run whose population an ego is held against.
+    """
+
+    folder: Path
+    row: str
+    episodes: int
+    holdouts: Mapping[str, Path]
+
+
+def measure_scores(job: RunToMeasure) -> dict[str, Any]:
+    """Of the run's own evaluation: SP, XP, beside random and idle, what remains after cross-play, obstruction."""
+    scores = read_run(job.folder).scores
+    found = {name: scores[name]["mean"] for name in ("sp", "xp")}
+    found |= {partner: scores["beside"][partner]["both"]["mean"] for partner in (RANDOM, IDLE)}
+    members = scores.get("mixed_play", {}).get("members", [])
+    shares = [one[seat]["kept"]["mean"] for one in members for seat in ("seat_0", "seat_1")]
+    known = [share for share in shares if share is not None]
+    if known:
+        found |= {"mixed": float(np.mean(known)), "mixed_least": min(known)}
+    if "pairs" in scores["obstruction"]:
+        found["obstructed"] = len({tuple(one["pair"]) for one in scores["obstruction"]["pairs"]})
+    return found
+
+
+def measure_costs(job: RunToMeasure) -> dict[str, Any]:
+    """Environment steps and minutes: of the first member, of each later one on average, in all, and cumulative."""
+    members = read_run(job.folder).members
+    steps = [member.real for member in members]
+    simulated = sum(member.steps.get(str(Kind.SIMULATED), 0) for member in members)
+    found = {"first": steps[0], "real": sum(steps), "by_members": list(accumulate(steps)), "simulated": simulated}
+    if len(steps) > 1:
+        found["later"] = float(np.mean(steps[1:]))
+    minutes = [member.seconds / 60 for member in members if member.seconds is not None]
+    if len(minutes) == len(members):
+        found |= {"first_minutes": minutes[0], "minutes": sum(minutes), "minutes_by_members": list(accumulate(minutes))}
+        if len(minutes) > 1:
+            found["later_minutes"] = float(np.mean(minutes[1:]))
+    return found
+
+
+def measure_curves(job: RunToMeasure) -> dict[str, Any]:
+    """Real self-play in training: of the first member, and the mean of the later ones against own and simulated steps;
+    where that is first at SHARE of the later members' score in the run's evaluation."""
+    run = read_run(job.folder)
+    first, later = run.members[:1], run.members[1:]
+    table = run.scores["matrix"]["mean"]
+    found: dict[str, Any] = {
+        "first": _average_curve(first, simulated=False),
+        "later": _average_curve(later, simulated=False),
+        "later_simulated": _average_curve(later, simulated=True),
+        "first_final": table[0][0],
+    }
+    if later:
+        found["final"] = float(np.mean([table[row][row] for row in range(1, len(run.members))]))
+        for name, curve in (("reached", found["later"]), ("reached_simulated", found["later_simulated"])):
+            above = [steps for steps, score in curve if score >= SHARE * found["final"]]
+            found |= {name: above[0]} if above and found["final"] > 0 else {}
+    return {name: value for name, value in found.items() if value != []}
+
+
+def _average_curve(members: Sequence[MemberRecord], *, simulated: bool) -> list[list[float]]:
+    """[step, score] on a grid that all members reach; empty where nothing was kept."""
+    found = [[(p.simulated if simulated else p.step, p.sp) for p in member.curve] for member in members]
+    known = [np.array(points, float) for points in found if len(points) > 1]
+    end = min((points[-1, 0] for points in known), default=0.0)
+    if not end:
+        return []
+    grid = np.linspace(0.0, end, GRID)
+    mean = np.mean([np.interp(grid, points[:, 0], points[:, 1]) for points in known], axis=0)
+    return [[float(step), float(score)] for step, score in zip(grid, mean, strict=True)]
+
+
+def measure_held(job: RunToMeasure) -> dict[str, Any]:
+    """How many members pass a held evaluation, and the real steps taken in all by then where all do."""
+    run = read_run(job.folder)
+    limits = default_thresholds(run.environment.name)
+    if limits is None:
+        return {}
+    held = hold_members(load_population(job.folder / "population"), job.episodes, HELD_SEED)
+    last = quality_costs(run, limits, held)[-1]
+    return {"passed": last.reached, "sp": limits.sp, "xp": limits.xp} | ({} if last.bound else {"steps": last.steps})
+
+
+def measure_exits(job: RunToMeasure) -> dict[str, Any]:
+    """Who leaves rendezvous in cross-play; nothing where players cannot leave."""
+    try:
+        source = open_sources([(job.row, job.folder)])[0]
+    except UserError:
+        return {}
+    row = describe_population(measure_source(source, job.episodes, SEED))
+    landmarks = row["landmarks"]
+    return {
+        "any_exit": row["average_ended_early"],
+        "own_exit": row["average"],
+        "by_agent": row["ended_early"],
+        **{name: row[name]["mean"] for name in ("sp", "xp", "xp_apart")},
+        **{partner: row["beside"][partner]["mean"] for partner in (RANDOM, IDLE)},
+        **({"landmarks": len(landmarks["used"]), "sharing": len(row["pairs"]["sharing"])} if landmarks else {}),
+    }
+
+
+def measure_diversity(job: RunToMeasure) -> dict[str, Any]:
+    """BR-Div over the members' events in play with themselves."""
+    opened = open_sides({"partner": [(None, str(job.folder))]}, title_of)
+    players = [player for group in opened.sides["partner"] for player in group.players]
+    name, params = opened.environment.name, opened.environment.params
+
+    def make(num_envs: int, seed: int) -> Any:
+        return make_env(name, num_envs, seed=seed, **params)
+
+    found = measure_partners(make, players, None, job.episodes, SEED).diversity
+    log = found.log_determinant
+    return {"effective_rank": found.effective_rank, **({"log_determinant": log} if math.isfinite(log) else {})}
+
+
+def measure_ego(job: RunToMeasure) -> dict[str, Any]:
+    """Score of an ego beside each held-out population, their mean, and its worst pair."""
+    wanted = {"ego": [("ego", str(job.folder))], "partner": [(t, str(path)) for t, path in job.holdouts.items()]}
+    opened = open_sides(wanted, title_of)
+    check_disjoint(opened.sides["ego"], opened.sides["partner"])
+    environment = opened.environment
+
+    def make(num_envs: int, seed: int) -> Any:
+        return make_env(environment.name, num_envs, seed=seed, **environment.params)
+
+    casting = Casting(opened.sides["ego"], opened.sides["partner"])
+    report = to_dict(evaluate_holdout(casting, environment, make, job.episodes, SEED))
+    means = {one["partners"]: one["mean"] for one in report["standings"] if one["partners"] in job.holdouts}
+    worst = min(one["worst"]["score"] for one in report["standings"])
+    return {**means, "average": float(np.mean(list(means.values()))), "worst": worst}
+
+
+def measure_conventions(job: RunToMeasure) -> dict[str, Any]:
+    """How members' dishes go with what they do, pooled as in the paper, and how near they come to recorded people."""
+    games = count_members(load_population(job.folder / "population"), job.episodes, SEED)
+    layout = games[0].layout
+    effects = [one for one in tabulate_effects(games, CONVENTION_SPREAD, pooled=True) if "share" not in one.behaviour]
+    found = {f"{one.behaviour} {one.group}": one.effect for one in effects if math.isfinite(one.effect)}
+    if layout not in LAYOUTS:
+        return found
+    covered = measure_coverage(count_people(load_games(layouts=[layout])), games, seed=SEED)
+    return {**found, "nearest": covered.nearest, "shuffled": covered.shuffled, "average": covered.average}
+
+
+MEASURES: dict[str, Callable[[RunToMeasure], dict[str, Any]]] = {
+    "scores": measure_scores,
+    "costs": measure_costs,
+    "curves": measure_curves,
+    "held": measure_held,
+    "sabotage": measure_exits,
+    "diversity": measure_diversity,
+    "holdout": measure_ego,
+    "conventions": measure_conventions,
+}
+"""Name -> measure."""
+
+
+def round_figures(value: Any) -> Any:
+    """Floats to six significant digits, in lists and dictionaries too."""
+    if isinstance(value, dict):
+        return {name: round_figures(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [round_figures(one) for one in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def describe_seconds(run: RunRecord) -> float | None:
+    """Of all members' training, None where one's is unknown."""
+    times = [member.seconds for member in run.members]
+    return None if None in times else float(sum(time for time in times if time is not None))

@@ -1,0 +1,124 @@
+"""Records as Markdown: one target's report, and the page of all that is published."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from popgen.errors import UserError
+from popgen.reports.reproduction.run_tables import LEVEL, make_run_sheet, make_sheets
+from popgen.reports.reproduction.target_records import Record
+from popgen.reports.reproduction.target_registry import TARGETS
+
+FORMAT, VERSION = "popgen-reproduction", 1
+MOST_BYTES = 50_000
+"""Of a record."""
+
+WIDTH = 100
+
+_HEAD = f"""# Measured results
+
+`popgen reproduce` wrote this page from the records in `docs/results/`; no number is typed by hand.
+`popgen reproduce --results docs/results.md` writes it again. A cell is the mean over seeds with its
+interval at {LEVEL} (Student's t) in brackets, or the one seed's figure; "-" was not measured. Rows
+marked (paper) are the paper's. Figures of earlier runs whose records were not kept are in
+[earlier measurements](notes/measurements.md).
+"""
+
+
+def read_record(path: Path) -> Record:
+    """A target's record.
+
+    Raises:
+        UserError: it cannot be read, or is none.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(str(path), f"cannot be read ({error})", "restore it from a copy") from None
+    if not isinstance(values, dict) or values.get("format") != FORMAT or values.get("target") not in TARGETS:
+        raise UserError(str(path), "is no record of popgen reproduce", "remove it from the folder")
+    return values
+
+
+def to_record_text(record: Record) -> str:
+    """The JSON text of a record."""
+    return json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def read_records(folder: Path) -> list[Record]:
+    """All records of a folder, in the registry's order.
+
+    Raises:
+        UserError: there are none, or one cannot be read.
+    """
+    records = [read_record(path) for path in sorted(folder.glob("*.json"))]
+    if not records:
+        raise UserError(str(folder), "holds no records", "make some with popgen reproduce TARGET --publish DIR")
+    order = list(TARGETS)
+    return sorted(records, key=lambda one: (order.index(one["target"]), one["budget"], one["command"]))
+
+
+def to_page(records: Sequence[Record]) -> str:
+    """The page of measured results."""
+    return "\n".join([_HEAD, *(to_section(record) for record in records)])
+
+
+def to_section(record: Record, level: int = 2) -> str:
+    """A target's part of the page: the paper's claim, tables, what is missing, and where the figures come from."""
+    target = TARGETS[record["target"]]
+    lines = [f"{'#' * level} {target.title}", ""]
+    if target.source:
+        lines += [_wrap(f"The paper's {target.source}: {target.claim}"), ""]
+    lines += ["```", record["command"], "```", ""]
+    for sheet in make_sheets(record, target):
+        lines += [f"{sheet.title}:", "", sheet.to_markdown(), ""]
+    lines += [_wrap(note, "- ") for note in (*target.notes, *_list_origins(record))]
+    lines += [_wrap(text, "- ") for text in _list_missing(record)]
+    lines += ["", make_run_sheet(record, target).to_markdown(), ""]
+    return "\n".join(lines)
+
+
+def _wrap(text: str, start: str = "") -> str:
+    options = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.fill(text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start), **options)
+
+
+def _list_origins(record: Record) -> list[str]:
+    """Sentences: evaluation, machines, runs made before."""
+    runs = record["runs"]
+    told = [f"Budget {record['budget']}; {record['episodes']} episodes for each pair, written {record['written']}."]
+    machines = Counter(run["machine"] or "a machine that is not known" for run in runs)
+    told.append("Runs: " + "; ".join(f"{count} on {name}" for name, count in machines.items()) + ".")
+    if before := sum(run["taken_over"] for run in runs):
+        told.append(
+            f"{before} of {len(runs)} runs were made before this command was there and taken over: their settings, "
+            "seeds and files are these runs', the commit is not in their records where it says unknown."
+        )
+    if any(run["changed"] for run in runs):
+        told.append("A commit with + had changes that were not committed.")
+    return told
+
+
+def _list_missing(record: Record) -> list[str]:
+    counts: dict[tuple[str, str], list[int]] = {}
+    for one in record["missing"]:
+        counts.setdefault((one["row"], one["environment"]), []).append(one["seed"])
+    if not counts:
+        return []
+    parts = [f"{row} in {name}, seeds {', '.join(map(str, seeds))}" for (row, name), seeds in counts.items()]
+    return [f"Not run: {'; '.join(parts)}."]
+
+
+def to_report(record: Record) -> str:
+    """A target's own report: its section, and the exact command of every run."""
+    commands = [_describe_command(run) for run in record["runs"]]
+    return "\n".join([to_section(record, 1), "## Commands", "", "```", *dict.fromkeys(commands), "```", ""])
+
+
+def _describe_command(run: Mapping[str, Any]) -> str:
+    return str(run["command"])

@@ -1,0 +1,159 @@
+"""Which runs the targets want, by budget and seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from popgen.methods.registry import METHODS, find_objective, list_objectives, methods_with
+from popgen.reports.method_titles import name_of, title_of
+from popgen.reports.paper_figures import BASELINES, OWN_METHOD, RENDEZVOUS, SIMULATOR_METHOD
+from popgen.reports.reproduction.target_records import Budget, WantedRun
+
+EGO = "hipt"
+"""The method of the paper's egos."""
+
+MODEL, SIMULATOR = name_of(OWN_METHOD), name_of(SIMULATOR_METHOD)
+COMPARED = (MODEL, SIMULATOR, *(name_of(title) for title in BASELINES))
+TEACHERS = (*(name_of(title) for title in BASELINES), MODEL)
+"""Whose populations train egos and are held out, in the paper's order."""
+
+NEEDS_RAY = "ppo.max_steps"
+"""Methods with this setting learn on RLlib, which runs nowhere else."""
+
+KL = "world_model.kl_predecessors"
+SCORES, COSTS = "scores", "costs"
+
+
+def list_words(budget: Budget, label: str, environment: str, changes: Mapping[str, Any] | None = None) -> list[str]:
+    """Overrides of a run.
+
+    Args:
+        budget: its recipe, sizes and settings.
+        label: `method` or `method:objective`.
+        environment: registry name.
+        changes: settings on top of all.
+    """
+    method = label.partition(":")[0]
+    on_rendezvous = environment == RENDEZVOUS
+    agents, each = budget.rendezvous_agents if on_rendezvous else budget.agents, METHODS[method].multiple
+    settings = {**find_objective(label), **(changes or {})}
+    return [
+        *(f"method={method}", f"env={environment}", f"scale={budget.scale}"),
+        f"population.size={-(-agents // each) * each}",
+        *(["run.transport=inline"] if budget.inline and method not in methods_with(NEEDS_RAY) else []),
+        *(budget.rendezvous if on_rendezvous else ()),
+        *budget.settings,
+        *(f"{name}={'null' if value is None else value}" for name, value in settings.items()),
+    ]
+
+
+def want_runs(
+    budget: Budget,
+    seeds: Sequence[int],
+    labels: Sequence[str],
+    environments: Sequence[str],
+    measures: Sequence[str],
+) -> list[WantedRun]:
+    """A run of each label in each environment with each seed; seeds vary slowest, so that the first is complete
+    early."""
+    return [
+        WantedRun(title_of(label), tuple(list_words(budget, label, name)), seed, tuple(measures))
+        for seed in seeds
+        for name in environments
+        for label in labels
+    ]
+
+
+def want_variants(
+    budget: Budget,
+    seeds: Sequence[int],
+    label: str,
+    environment: str,
+    variants: Mapping[str, Mapping[str, Any]],
+    measures: Sequence[str],
+) -> list[WantedRun]:
+    """Runs of one label that differ in some settings: what a row is called -> its settings."""
+    title = title_of(label)
+    return [
+        WantedRun(f"{title}: {name}", tuple(list_words(budget, label, environment, changes)), seed, tuple(measures))
+        for seed in seeds
+        for name, changes in variants.items()
+    ]
+
+
+def list_sabotage(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """Every method with every objective on rendezvous."""
+    return want_runs(budget, seeds, list_objectives(), [RENDEZVOUS], ["sabotage", COSTS])
+
+
+def list_steps(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """Costs, and a held evaluation of each member."""
+    return want_runs(budget, seeds, COMPARED, budget.layouts, [COSTS, "held"])
+
+
+def list_scores(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """Self-play and cross-play of every method."""
+    return want_runs(budget, seeds, COMPARED, budget.layouts, [SCORES, COSTS])
+
+
+def list_curves(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """Learning curves."""
+    return want_runs(budget, seeds, COMPARED, budget.layouts, ["curves", SCORES])
+
+
+def list_times(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """The ring alone."""
+    return want_runs(budget, seeds, COMPARED, [budget.ring], [COSTS])
+
+
+def list_conventions(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """How much of what people do the populations cover."""
+    return want_runs(budget, seeds, COMPARED, budget.layouts, ["conventions", SCORES])
+
+
+def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """A row for each method that makes populations, in which the egos that they taught stand too."""
+    labels = [name for name, method in METHODS.items() if not method.trains_ego]
+    populations = want_runs(budget, seeds, labels, budget.layouts, [SCORES, COSTS, "diversity"])
+    return [*populations, *list_egos(budget, seeds)]
+
+
+def list_egos(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """An ego for each method's population, held against all methods' populations of another seed."""
+    found = []
+    for place, seed in enumerate(seeds):
+        other = seeds[(place + 1) % len(seeds)] if len(seeds) > 1 else seed + 1
+        for name in budget.layouts:
+            teachers = want_runs(budget, [seed], TEACHERS, [name], [SCORES])
+            holdouts = tuple(want_runs(budget, [other], TEACHERS, [name], [SCORES]))
+            for teacher in teachers:
+                words = (f"method={EGO}", f"scale={budget.scale}")
+                found.append(WantedRun(teacher.row, words, seed, ("holdout",), teacher, holdouts))
+    return found
+
+
+def list_encoders(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """XPM-Sim with and without an encoder that all members share."""
+    variants = {"separate agents": {}, "shared encoder": {f"{SIMULATOR}.encoder": "shared"}}
+    return want_variants(budget, seeds, SIMULATOR, RENDEZVOUS, variants, ["curves", SCORES, COSTS])
+
+
+def list_ablations(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """One part left out or put in at a time, each beside the recipe."""
+    layout = budget.layouts[0]
+    model = {
+        "recipe": {},
+        "KL to predecessors": {KL: 1.0},
+        "no self-play from cross-play states": {"agent.sp_from_xp": 0.0},
+    }
+    plain = {"env.params.exit_penalty": "none"}
+    rendezvous = {
+        "recipe": {},
+        "no self-play from cross-play states": {f"{SIMULATOR}.sims_restart": 0, f"{SIMULATOR}.restart_weight": 0.0},
+        "plain termination": plain,
+    }
+    return [
+        *want_variants(budget, seeds, MODEL, layout, model, [SCORES, COSTS]),
+        *want_variants(budget, seeds, f"{SIMULATOR}:ours", RENDEZVOUS, rendezvous, [SCORES, COSTS, "sabotage"]),
+    ]

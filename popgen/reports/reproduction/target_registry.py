@@ -1,0 +1,267 @@
+"""All tables and figures that `popgen reproduce` makes, and how much may be spent on them."""
+
+from __future__ import annotations
+
+from popgen.errors import UserError
+from popgen.reports.paper_ego_figures import EGOS
+from popgen.reports.paper_figures import CRAMPED, LAYOUT_NAMES, RENDEZVOUS, RING
+from popgen.reports.reproduction import paper_lines, run_lists
+from popgen.reports.reproduction.paper_lines import ANY_EXIT, AVERAGE, SP, TOTAL, XP
+from popgen.reports.reproduction.target_records import Budget, Column, Target
+
+ALL = "all"
+"""Name of all targets together."""
+
+BUDGETS = {
+    "smoke": Budget(
+        "smoke",
+        "minutes: every piece once, nothing learned",
+        scale="smoke",
+        agents=3,
+        rendezvous_agents=2,
+        layouts=(CRAMPED,),
+        ring=CRAMPED,
+        seeds=(1,),
+        episodes=2,
+        settings=("tracking.enabled=false",),
+        rendezvous=("xpm_sim.unroll=30",),
+        minutes=0.2,
+        inline=True,
+    ),
+    "laptop": Budget(
+        "laptop",
+        "two cores, about a day for all",
+        scale="laptop",
+        agents=3,
+        rendezvous_agents=8,
+        layouts=(CRAMPED, RING),
+        ring=RING,
+        seeds=(1, 2, 3),
+        episodes=20,
+        rendezvous=("evaluation.episodes=2", "ppo.max_steps=260000"),
+        minutes=10.0,
+    ),
+    "paper": Budget(
+        "paper",
+        "the paper's networks and steps; weeks on two cores",
+        scale="paper",
+        agents=8,
+        rendezvous_agents=8,
+        layouts=tuple(name for name in LAYOUT_NAMES if name != RENDEZVOUS),
+        ring=RING,
+        seeds=(1, 2, 3),
+        episodes=40,
+        minutes=600.0,
+    ),
+}
+"""Name -> budget."""
+
+_PLAY = (Column(SP, "scores.sp"), Column(XP, "scores.xp"))
+_BESIDE = (Column("beside random", "scores.random"), Column("beside idle", "scores.idle"))
+_MIXED = (
+    Column("mixed play", "scores.mixed"),
+    Column("mixed play, least", "scores.mixed_least"),
+    Column("obstructed pairs", "scores.obstructed", 1),
+)
+_COSTS = (Column("real steps", "costs.real", 0), Column("minutes", "costs.minutes", 1))
+
+TARGETS = {
+    target.name: target
+    for target in (
+        Target(
+            "table1",
+            "Self-sabotage on rendezvous",
+            'table "Results of the MPPMR environment"',
+            "XPM-Sim does not leave the task in cross-play, LIPO does, and its self-play is high.",
+            run_lists.list_sabotage,
+            (
+                Column(ANY_EXIT, "sabotage.any_exit", 3),
+                Column("own exit", "sabotage.own_exit", 3),
+                Column(SP, "sabotage.sp", 1),
+                Column(XP, "sabotage.xp", 1),
+                Column("XP apart", "sabotage.xp_apart", 1),
+                Column("landmarks", "sabotage.landmarks", 1),
+                Column("pairs at one", "sabotage.sharing", 1),
+                Column("beside random", "sabotage.random", 1),
+                Column("beside idle", "sabotage.idle", 1),
+            ),
+            "draw_bars",
+            (ANY_EXIT, XP),
+            paper_lines.list_sabotage_lines,
+            (
+                "Any exit: share of cross-play episodes with earlier agents that ended early, whoever left; the paper "
+                "counts these. Own exit: those in which this agent itself left. An exit costs the worst reward for "
+                "every step that was left. XP apart: of pairs that do not share a landmark, of which there are 4.",
+                "Not to leave is no merit of members that play like independent seeds: compare XP with self-play only.",
+                "`paper` is a method's published objective, `ours` the same bound and the same limit of cross-play in "
+                "every method.",
+            ),
+        ),
+        Target(
+            "steps-by-members",
+            "Environment steps by number of agents",
+            'figure "Scaling by number of agents"',
+            "XPM-WM needs an expensive first agent and cheap later ones, so that it grows slowest.",
+            run_lists.list_steps,
+            (
+                Column("agent 1", "costs.first", 0),
+                Column("each later", "costs.later", 0),
+                Column(TOTAL, "costs.real", 0),
+                Column("simulated", "costs.simulated", 0),
+                Column("agents that pass", "held.passed", 1),
+                Column("steps until all pass", "held.steps", 0),
+            ),
+            "draw_members",
+            ("costs.by_members",),
+            paper_lines.list_step_lines,
+            (
+                "An agent passes by a held evaluation of its own policy: SP at least 0.8 and XP with its strongest "
+                "partner at most 0.2 of the SP of the paper's XPM-WM. Simulated steps are in no total.",
+            ),
+        ),
+        Target(
+            "sp-xp",
+            "Self-play and cross-play",
+            'table "Average SP and XP Results"',
+            "XPM-WM's populations play best with themselves and least with each other.",
+            run_lists.list_scores,
+            (*_PLAY, *_BESIDE, *_MIXED, *_COSTS),
+            "draw_bars",
+            (SP, XP),
+            paper_lines.list_score_lines,
+            (
+                "XP below play beside a random partner is obstruction, not another convention. Mixed play: what "
+                "remains of self-play from a random step of a cross-play episode on, over members and seats.",
+            ),
+        ),
+        Target(
+            "ego",
+            "Egos beside held-out populations",
+            'table "Results for Ego agents", and the tables by layout',
+            "An ego trained with XPM-WM's population does as well beside all hold-outs as with any other.",
+            run_lists.list_egos,
+            (
+                *(Column(f"beside {ego}", f"holdout.{ego}") for ego in EGOS),
+                Column(AVERAGE, "holdout.average"),
+                Column("worst pair", "holdout.worst"),
+            ),
+            "draw_bars",
+            (AVERAGE,),
+            paper_lines.list_ego_lines,
+            ("A row is the method whose population trained the ego; held out are populations of the next seed.",),
+        ),
+        Target(
+            "curves",
+            "Self-play in training",
+            'figure "Training Curves for all 5 Overcooked layouts"',
+            "Later agents of XPM-WM learn faster, by self-play steps, than those of the others.",
+            run_lists.list_curves,
+            (
+                Column("final, later agents", "curves.final", 2),
+                Column("steps to 80 % of it", "curves.reached", 0),
+                *_PLAY,
+            ),
+            "draw_lines",
+            ("curves.later",),
+            notes=("Own real steps of a later agent of all kinds, of which self-play's are a part.",),
+        ),
+        Target(
+            "wall-clock",
+            "Training time by number of agents",
+            'figures "Training wall clock time"',
+            "XPM-WM's first agent takes longest, its later ones least.",
+            run_lists.list_times,
+            (
+                Column("agent 1, minutes", "costs.first_minutes", 1),
+                Column("each later", "costs.later_minutes", 1),
+                Column("in all", "costs.minutes", 1),
+            ),
+            "draw_members",
+            ("costs.minutes_by_members",),
+            notes=("Wall-clock on a machine that other work may have shared: upper bounds.",),
+        ),
+        Target(
+            "shared-encoder",
+            "An encoder that all agents share",
+            'figure "XPM-Sim with and without the shared encoder"',
+            "A shared encoder alone does not help later agents: it is the world model's dynamics that do.",
+            run_lists.list_encoders,
+            (
+                Column("final, later agents", "curves.final", 2),
+                Column("simulated steps to 80 % of it", "curves.reached_simulated", 0),
+                *_PLAY,
+            ),
+            "draw_lines",
+            ("curves.later_simulated",),
+        ),
+        Target(
+            "conventions",
+            "What people do, and how much of it populations do",
+            'table "Difference in average number of dishes served with specific human conventions"',
+            "The ego of XPM-WM's population differs least between people of different conventions.",
+            run_lists.list_conventions,
+            (
+                *(
+                    Column(f"{behaviour}, {group}", f"conventions.{behaviour} {group}")
+                    for behaviour in ("plating", "onion picking", "movement")
+                    for group in ("high", "low")
+                ),
+                Column("nearest", "conventions.nearest"),
+                Column("of the average person", "conventions.average"),
+            ),
+            "draw_bars",
+            ("nearest", "of the average person"),
+            paper_lines.list_convention_lines,
+            (
+                "The paper's people played with its egos; nobody has played with ours. Ours are members in self-play: "
+                "dishes of the high and of the low group less those of all, pooled as in the paper. Nearest: median "
+                "distance of a recorded person to the nearest member, in people's standard deviations; a population "
+                "covers people only where it is below that of the average person.",
+            ),
+        ),
+        Target(
+            "ablations",
+            "One part left out or put in",
+            "",
+            "",
+            run_lists.list_ablations,
+            (*_PLAY, *_BESIDE, *_MIXED, Column(ANY_EXIT, "sabotage.any_exit", 3), *_COSTS),
+            "draw_bars",
+            (SP, XP),
+        ),
+        Target(
+            "generators",
+            "All generators of populations",
+            "",
+            "",
+            run_lists.list_generators,
+            (
+                *_PLAY,
+                *_BESIDE,
+                *_MIXED,
+                Column("BR-Div, log det", "diversity.log_determinant", 1),
+                Column("effective rank", "diversity.effective_rank", 1),
+                *_COSTS,
+                Column("its ego, average", "holdout.average"),
+            ),
+            "draw_bars",
+            (SP, XP),
+            paper_lines.list_score_lines,
+            ("Egos are trained for the populations of the paper's three methods; they stand in those rows.",),
+        ),
+    )
+}
+"""Name -> target."""
+
+
+def find_targets(name: str) -> list[Target]:
+    """The target with a name, or all.
+
+    Raises:
+        UserError: there is none.
+    """
+    if name == ALL:
+        return list(TARGETS.values())
+    if name not in TARGETS:
+        raise UserError("TARGET", f"there is no target {name!r}", f"choose one of {', '.join((*TARGETS, ALL))}")
+    return [TARGETS[name]]

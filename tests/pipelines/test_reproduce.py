@@ -1,0 +1,177 @@
+"""`popgen reproduce`: pieces that stay, a kill after any of them, runs that are taken over; training takes no time."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.finished import finished_run
+
+import popgen.pipelines as pipelines
+from popgen.config.run_config import RunConfig
+from popgen.errors import UserError
+from popgen.pipelines import run_measures
+from popgen.pipelines.run_measures import RunToMeasure, measure_costs, measure_curves, measure_held, measure_scores
+
+Run = Callable[..., tuple[int, str, str]]
+SMALL = ("population.size=2", "--budget", "smoke", "--out", "out", "--quiet")
+
+
+class Training:
+    """In place of `popgen.pipelines.population`: a finished run at once, or an end of the process.
+
+    Attributes:
+        calls: configurations in order.
+        killed_at: the call that ends the process instead.
+        refused: methods whose training fails.
+    """
+
+    def __init__(self) -> None:
+        self.calls: list[RunConfig] = []
+        self.killed_at = 0
+        self.refused: set[str] = set()
+
+    def train(self, config: RunConfig, *, reporter: Any) -> None:
+        """`run_population`."""
+        self.calls.append(config)
+        if len(self.calls) == self.killed_at:
+            raise KeyboardInterrupt
+        if config.method in self.refused:
+            raise UserError("training", "diverged", "lower the learning rates")
+        steps = [{"SP": 100 * member, "XP": 10 * (member - 1)} for member in range(1, config.population.size + 1)]
+        given = config.as_dict()
+        settings = {name: given[name] for name in given if name not in ("method", "env", "population", "run")}
+        finished_run(
+            Path(config.run.root),
+            str(config.run.id),
+            steps,
+            method=config.method,
+            seed=config.run.seed,
+            env=config.env.name,
+            params=dict(config.env.params),
+            settings=settings,
+        )
+
+
+@pytest.fixture
+def training(monkeypatch: pytest.MonkeyPatch) -> Training:
+    stand_in = Training()
+    module = type(sys)("popgen.pipelines.population")
+    module.run_population = stand_in.train  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "popgen.pipelines.population", module)
+    monkeypatch.setattr(pipelines, "population", module, raising=False)
+    return stand_in
+
+
+def test_a_target_from_runs_to_table(run: Run, training: Training, tmp_path: Path) -> None:
+    code, out, err = run("reproduce", "wall-clock", *SMALL, "--json")
+    assert code == 0, err
+    told = json.loads(out)["targets"][0]
+    assert (told["runs_done"], told["measures_done"], told["seconds_left"]) == (4, 4, 0)
+    folder = tmp_path / "out" / "wall-clock"
+    assert {path.name for path in folder.iterdir()} == {
+        "record.json",
+        "report.md",
+        "rows.csv",
+        "chart.png",
+        "chart.svg",
+    }
+    record = json.loads((folder / "record.json").read_text())
+    first = record["runs"][0]
+    assert first["figures"]["costs"]["by_members"] == [100, 310] and first["figures"]["costs"]["minutes"] == 2.0
+    assert first["command"].startswith("popgen run method=xpm_wm env=overcooked/cramped_room scale=smoke")
+    assert first["machine"] and not first["taken_over"] and record["missing"] == []
+    assert "| XPM-WM " in (folder / "report.md").read_text()
+
+
+def test_finished_pieces_stay_whatever_ended_the_command(run: Run, training: Training, tmp_path: Path) -> None:
+    """Killed at the third of four runs; the same command makes the other two, and a third time nothing."""
+    training.killed_at = 3
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 130
+    assert run("reproduce", "wall-clock", *SMALL, "--dry-run")[0] == 0
+    code, out, _ = run("reproduce", "wall-clock", *SMALL, "--dry-run", "--json")
+    assert (
+        code == 0 and json.loads(out)["targets"][0]["runs_done"] == 2 and json.loads(out)["targets"][0]["seconds_left"]
+    )
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 0
+    assert len(training.calls) == 5 and [c.method for c in training.calls[2:]] == ["lipo", "lipo", "comedi"]
+    before = (tmp_path / "out" / "wall-clock" / "record.json").read_bytes()
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 0 and len(training.calls) == 5
+    assert (tmp_path / "out" / "wall-clock" / "record.json").read_bytes() == before
+
+
+def test_targets_share_their_runs(run: Run, training: Training) -> None:
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 0
+    code, out, _ = run("reproduce", "sp-xp", *SMALL, "--json")
+    assert code == 0 and len(training.calls) == 4 and json.loads(out)["targets"][0]["runs"] == 4
+
+
+def test_a_run_that_fails_holds_up_nothing_but_itself(run: Run, training: Training, tmp_path: Path) -> None:
+    training.refused = {"lipo"}
+    code, _, err = run("reproduce", "wall-clock", *SMALL)
+    assert code == 2 and "1 pieces failed, LIPO, seed 1: training: diverged" in err and err.count("\n") == 1
+    record = json.loads((tmp_path / "out" / "wall-clock" / "record.json").read_text())
+    assert [one["row"] for one in record["runs"]] == ["XPM-WM", "XPM-Sim", "CoMeDi"]
+    assert [(one["row"], one["seed"]) for one in record["missing"]] == [("LIPO", 1)]
+    training.refused = set()
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 0 and len(training.calls) == 5
+
+
+def test_finished_runs_of_elsewhere_are_taken_if_they_are_the_same(
+    run: Run, training: Training, tmp_path: Path
+) -> None:
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 0
+    there = ("reproduce", "wall-clock", "population.size=2", "--budget", "smoke", "--out", "b", "--runs", "out/runs")
+    assert run(*there, "--quiet", "--publish", "kept")[0] == 0 and len(training.calls) == 4
+    kept = json.loads((tmp_path / "kept" / "wall-clock-smoke.json").read_text())
+    assert all(one["taken_over"] for one in kept["runs"]) and len(kept["runs"]) == 4
+    assert run(*there[:-4], "--out", "c", *there[-2:], "--quiet", "--seeds", "2")[0] == 0
+    assert len(training.calls) == 8  # of another seed
+
+
+def test_the_list_and_the_page(run: Run, training: Training, tmp_path: Path) -> None:
+    code, out, _ = run("reproduce", "--list")
+    assert (
+        code == 0 and "table1" in out and 'table "Results of the MPPMR environment"' in out and "--budget paper" in out
+    )
+    assert run("reproduce", "wall-clock", *SMALL, "--publish", "results", "--results", "results.md")[0] == 0
+    page = (tmp_path / "results.md").read_bytes()
+    assert run("reproduce", "--results", "results.md")[0] == 0
+    assert (tmp_path / "results.md").read_bytes() == page and b"## Training time" in page
+
+
+def test_what_is_refused_in_one_line(run: Run, training: Training) -> None:
+    for words, told in {
+        ("reproduce",): "TARGET: is missing",
+        ("reproduce", "table9"): "there is no target",
+        ("reproduce", "table1", "--budget", "none"): "there is no budget",
+        ("reproduce", "table1", "agent.lambda=1"): "agent.lambda",
+        ("reproduce", "--results", "nothing.md"): "holds no records",
+    }.items():
+        code, out, err = run(*words, "--quiet")
+        assert code == 2 and out == "" and told in err and err.count("\n") == 1, err
+    assert training.calls == []
+
+
+def test_measures_of_a_finished_run(tmp_path: Path) -> None:
+    """Numbers by hand: steps 1000 then 50 each, half of the way up at half of the steps."""
+    steps = [{"random": 600, "SP": 400}, {"SP": 30, "XP": 20}, {"SP": 30, "XP": 20}]
+    curves = {member: [(0, 0.0, None), (50, 10.0, 1.0)] for member in (2, 3)}
+    folder = finished_run(tmp_path, "one", steps, seconds=[120.0, 30.0, 90.0], curves=curves)
+    job = RunToMeasure(folder, "XPM-WM", 2, {})
+    costs = measure_costs(job)
+    assert (costs["first"], costs["later"], costs["real"], costs["by_members"]) == (1000, 50, 1100, [1000, 1050, 1100])
+    assert (costs["first_minutes"], costs["later_minutes"], costs["minutes"]) == (2.0, 1.0, 4.0)
+    found = measure_curves(job)
+    assert found["later"][10] == [25.0, 5.0] and found["later"][-1] == [50.0, 10.0] and "first" not in found
+    scores = measure_scores(job)
+    assert (scores["sp"], scores["xp"]) == (10.0, 0.5) and {"random", "idle"} <= set(scores)
+    held = measure_held(job)
+    assert held["passed"] == 0 and "steps" not in held  # random players serve nothing
+    assert run_measures.measure_exits(job) == {}  # nobody can leave a kitchen
+    assert run_measures.measure_diversity(job)["effective_rank"] >= 1.0
+    assert run_measures.round_figures({"a": [1.23456789, 2]}) == {"a": [1.23457, 2]}

@@ -1,0 +1,147 @@
+"""Targets, their tables as pure functions of a record, and the page of measured results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import ROOT
+
+from popgen.errors import UserError
+from popgen.methods.registry import METHODS, list_objectives
+from popgen.reports.charts import reproduction_charts
+from popgen.reports.reproduction.results_page import (
+    MOST_BYTES,
+    read_record,
+    read_records,
+    to_page,
+    to_record_text,
+    to_report,
+)
+from popgen.reports.reproduction.run_tables import make_sheets, summarise_runs, take_interval, to_rows_csv
+from popgen.reports.reproduction.target_registry import ALL, BUDGETS, TARGETS, find_targets
+
+PUBLISHED = ROOT / "docs" / "results"
+
+
+def run(row: str, seed: int, figures: dict[str, Any], environment: str = "rendezvous/mppmr") -> dict[str, Any]:
+    told = {"method": row.partition(",")[0], "command": f"popgen run seed={seed}", "run": f"{row}-{seed}"}
+    origin = {"commit": "0123456789", "changed": False, "versions": {}, "machine": "2 cores", "taken_over": seed == 3}
+    return {"row": row, "environment": environment, "seed": seed, **told, **origin, "seconds": 60.0, "figures": figures}
+
+
+def record(target: str, runs: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    head = {"format": "popgen-reproduction", "format_version": 1, "target": target, "budget": "laptop", "seeds": [1]}
+    tail = {"settings": [], "episodes": 20, "command": f"popgen reproduce {target}", "written": "2026-01-01"}
+    return {**head, **tail, "runs": runs, "missing": [], **more}
+
+
+def sabotage(seed: int, exits: float, xp: float) -> dict[str, Any]:
+    return run("LIPO, paper", seed, {"sabotage": {"any_exit": exits, "xp": xp}})
+
+
+def test_an_interval_over_seeds_is_students() -> None:
+    """1, 2, 3: mean 2, deviation 1, 4.303 / sqrt(3) = 2.4843 either way."""
+    found = take_interval([1.0, 2.0, 3.0])
+    assert found is not None and found.mean == 2.0
+    assert found.high == pytest.approx(4.4843, abs=1e-4) and found.low == pytest.approx(-0.4843, abs=1e-4)
+    assert found.to_text(1) == "2.0 (-0.5 to 4.5)"
+    one = take_interval([5.0])
+    assert one is not None and one.to_text(2) == "5.00" and take_interval([]) is None
+
+
+def test_runs_of_a_row_are_its_seeds() -> None:
+    rows = summarise_runs(
+        record("table1", [sabotage(2, 0.2, -10), sabotage(1, 0.0, -30), run("XPM-Sim, ours", 1, {})]),
+        TARGETS["table1"].columns,
+    )
+    assert [(row.label, row.seeds) for row in rows] == [("LIPO, paper", (1, 2)), ("XPM-Sim, ours", (1,))]
+    cells = rows[0].cells
+    assert cells["any exit"] is not None and cells["any exit"].mean == pytest.approx(0.1)
+    assert cells["SP"] is None and rows[1].cells["any exit"] is None
+
+
+def test_the_papers_rows_stand_below_ours() -> None:
+    sheet = make_sheets(record("table1", [sabotage(1, 0.067, -22.2)]), TARGETS["table1"])[0]
+    table = sheet.frame.set_index("")
+    assert table.loc["LIPO, paper", "any exit"] == "0.067" and table.loc["LIPO (paper)", "any exit"] == "0.59"
+    assert table.loc["XPM-Sim (paper)", "XP"] == "-114.5" and sheet.dim == {1, 2, 3}
+    assert "landmarks" not in table.columns  # nobody has that figure
+
+
+def test_csv_has_ours_and_the_papers() -> None:
+    lines = to_rows_csv(record("table1", [sabotage(1, 0.5, -3), sabotage(2, 0.7, -5)]), TARGETS["table1"]).splitlines()
+    assert lines[0].startswith("source,row,environment,seeds,any exit,any exit low,any exit high,own exit")
+    assert lines[1].startswith('popgen,"LIPO, paper",rendezvous/mppmr,1 2,0.6,') and lines[2].startswith("paper,LIPO")
+
+
+@pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
+@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
+def test_every_target_lists_runs_that_its_columns_can_be_filled_from(target: Any, budget: Any) -> None:
+    runs = target.list_runs(budget, budget.seeds)
+    measured = {name for one in runs for name in one.measures}
+    assert runs and {column.figure.partition(".")[0] for column in target.columns} <= measured
+    assert len(set(runs)) == len(runs)
+    assert {one.seed for one in runs} == set(budget.seeds)
+    titles = {column.title for column in target.columns}
+    assert all(name in titles for name in target.charted) or all("." in name for name in target.charted)
+    assert target.chart in reproduction_charts.CHARTS
+
+
+def test_the_table_of_sabotage_has_every_objective_and_the_generators_every_method() -> None:
+    budget = BUDGETS["laptop"]
+    assert len(TARGETS["table1"].list_runs(budget, [1])) == len(list_objectives())
+    rows = {one.row for one in TARGETS["generators"].list_runs(budget, [1])}
+    assert rows == {method.title for method in METHODS.values() if not method.trains_ego}
+
+
+def test_an_ego_is_held_against_populations_that_it_never_met() -> None:
+    for seeds in ((1, 2, 3), (1,)):
+        for one in TARGETS["ego"].list_runs(BUDGETS["laptop"], seeds):
+            assert one.teacher is not None and {other.seed for other in one.holdouts} != {one.teacher.seed}
+            assert len(one.holdouts) == 3
+
+
+def test_a_target_that_is_not_there() -> None:
+    with pytest.raises(UserError, match="table1"):
+        find_targets("table9")
+    assert find_targets(ALL) == list(TARGETS.values())
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_charts_and_reports_of_incomplete_records(name: str, tmp_path: Path) -> None:
+    """One run without figures, and one with a curve: something is drawn, nothing fails."""
+    figures = {
+        "curves": {"later": [[0, 1.0], [10, 2.0]], "later_simulated": [[0, 1.0], [5, 3.0]]},
+        "costs": {"by_members": [5, 9], "minutes_by_members": [1.0, 2.0], "real": 9},
+        "scores": {"sp": 3.0, "xp": 1.0},
+    }
+    room = "overcooked/cramped_room"
+    missing = [{"row": "LIPO", "environment": room, "seed": 2, "why": "not made yet"}]
+    one = record(name, [run("XPM-WM", 1, figures, room), run("LIPO", 1, {}, room)], missing=missing)
+    reproduction_charts.draw_target(one, TARGETS[name], [tmp_path / "chart.png"])
+    assert (tmp_path / "chart.png").stat().st_size > 1000
+    assert "Not run: LIPO in overcooked/cramped_room, seeds 2." in to_report(one)
+
+
+def test_a_page_of_records_is_the_same_twice(tmp_path: Path) -> None:
+    for name in ("sp-xp", "table1"):
+        (tmp_path / f"{name}.json").write_text(to_record_text(record(name, [sabotage(3, 0.1, -1.0)])))
+    first, again = to_page(read_records(tmp_path)), to_page(read_records(tmp_path))
+    assert first == again and first.index("Self-sabotage") < first.index("## Self-play and cross-play")
+    assert "1 of 1 runs were made before this command was there" in first
+    (tmp_path / "other.json").write_text(json.dumps({"format": "popgen-crossplay"}))
+    with pytest.raises(UserError, match="no record of popgen reproduce"):
+        read_records(tmp_path)
+
+
+@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="nothing is published")
+def test_the_published_page_is_that_of_the_published_records() -> None:
+    """No number of docs/results.md is typed by hand, and each has a command and a machine."""
+    assert to_page(read_records(PUBLISHED)) == (ROOT / "docs" / "results.md").read_text()
+    for path in PUBLISHED.glob("*.json"):
+        assert path.stat().st_size < MOST_BYTES
+        for one in read_record(path)["runs"]:
+            assert one["command"].startswith("popgen ") and {"commit", "machine", "taken_over"} <= set(one)
