@@ -53,6 +53,7 @@ class Plan:
         command: that makes it again.
         compose: overrides -> a checked configuration.
         elsewhere: folders with finished runs that are taken instead of new ones.
+        trains: runs that are missing are made; without it what is finished is measured and told.
     """
 
     targets: Sequence[Target]
@@ -63,6 +64,7 @@ class Plan:
     command: str
     compose: Callable[[Sequence[str]], RunConfig]
     elsewhere: Sequence[Path] = ()
+    trains: bool = True
 
 
 @dataclass
@@ -205,7 +207,7 @@ class Reproduction:
             (self.plan.out / folder).mkdir(parents=True, exist_ok=True)
         jobs = list(self.jobs.values())
         for number, job in enumerate(jobs, start=1):
-            if not job.done:
+            if not job.done and self.plan.trains:
                 reporter.note(f"piece {number} of {len(jobs)}: {job.wanted.row}, seed {job.wanted.seed}")
                 self._attempt(job, lambda job=job: self._make_run(job, reporter))
         for job in jobs:

@@ -47,6 +47,7 @@ def add(commands: Any) -> None:
         *("--runs",), action="append", default=[], type=expand_home, metavar="DIR", help="take finished runs from here"
     )
     parser.add_argument("--dry-run", action="store_true", help="show what is done and what is left, start nothing")
+    parser.add_argument("--finished", action="store_true", help="train nothing: measure and tell what is finished")
     parser.add_argument("--publish", metavar="DIR", default=None, help="copy the targets' records to here")
     parser.add_argument(
         *("--results",), metavar="FILE", default=None, help="write the page of the records in FILE's folder `results`"
@@ -102,6 +103,7 @@ def _plan(args: argparse.Namespace) -> Reproduction:
         " ".join(map(shlex.quote, words)),
         _make_composer([*budget.settings, *budget.rendezvous, *args.overrides], args.config_dir),
         [Path(folder) for folder in args.runs],
+        trains=not args.finished,
     )
     return Reproduction(plan)
 

@@ -97,6 +97,8 @@ def test_finished_pieces_stay_whatever_ended_the_command(run: Run, training: Tra
     assert (
         code == 0 and json.loads(out)["targets"][0]["runs_done"] == 2 and json.loads(out)["targets"][0]["seconds_left"]
     )
+    assert run("reproduce", "wall-clock", *SMALL, "--finished")[0] == 0 and len(training.calls) == 3
+    assert len(json.loads((tmp_path / "out" / "wall-clock" / "record.json").read_text())["runs"]) == 2
     assert run("reproduce", "wall-clock", *SMALL)[0] == 0
     assert len(training.calls) == 5 and [c.method for c in training.calls[2:]] == ["lipo", "lipo", "comedi"]
     before = (tmp_path / "out" / "wall-clock" / "record.json").read_bytes()
