@@ -37,6 +37,7 @@ NOT_RUN = {
 """First words of commands that are not executed, and why."""
 
 ONLY_CHECKED = {
+    "reproduce": "hours: piece by piece in tests/pipelines",
     "experiment": "hours: planned and checked here, run at smoke scale in tests/pipelines",
     "humans fit": "half a minute for each population: tests/humans",
     "bench ego": "processes of its own: tests/pipelines",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import textwrap
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from popgen.errors import UserError
 from popgen.reports.reproduction.run_tables import LEVEL, make_run_sheet, make_sheets
@@ -74,7 +73,7 @@ def to_section(record: Record, level: int = 2) -> str:
     lines = [f"{'#' * level} {target.title}", ""]
     if target.source:
         lines += [_wrap(f"The paper's {target.source}: {target.claim}"), ""]
-    lines += ["```", record["command"], "```", ""]
+    lines += ["```sh", record["command"], "```", ""]
     for sheet in make_sheets(record, target):
         lines += [f"{sheet.title}:", "", sheet.to_markdown(), ""]
     lines += [_wrap(note, "- ") for note in (*target.notes, *_list_origins(record))]
@@ -116,9 +115,5 @@ def _list_missing(record: Record) -> list[str]:
 
 def to_report(record: Record) -> str:
     """A target's own report: its section, and the exact command of every run."""
-    commands = [_describe_command(run) for run in record["runs"]]
-    return "\n".join([to_section(record, 1), "## Commands", "", "```", *dict.fromkeys(commands), "```", ""])
-
-
-def _describe_command(run: Mapping[str, Any]) -> str:
-    return str(run["command"])
+    commands = [run["command"] for run in record["runs"]]
+    return "\n".join([to_section(record, 1), "## Commands", "", "```sh", *dict.fromkeys(commands), "```", ""])
