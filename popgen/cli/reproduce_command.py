@@ -17,7 +17,7 @@ from popgen.errors import UserError
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
-    from popgen.pipelines.reproduce import Reproduction
+    from popgen.pipelines.reproduction_pieces import Pieces
     from popgen.reports.reproduction.target_records import Budget
 
 DEFAULT_BUDGET = "laptop"
@@ -64,6 +64,7 @@ def reproduce(args: argparse.Namespace) -> int:
     if args.target is None:
         raise UserError("TARGET", "is missing", "name one, see popgen reproduce --list")
     before_ray(1, True)
+    from popgen.pipelines.reproduce import make_all
     from popgen.progress import make_reporter
 
     work = _plan(args)
@@ -72,7 +73,7 @@ def reproduce(args: argparse.Namespace) -> int:
     if not args.quiet:
         _print_screen(work, to_stderr=True)
     with closing(make_reporter(quiet=args.quiet)) as reporter:
-        records = work.make_all(reporter)
+        records = make_all(work, reporter)
     if args.publish is not None:
         _publish(records, Path(args.publish))
     if args.results is not None:
@@ -84,8 +85,8 @@ def reproduce(args: argparse.Namespace) -> int:
     return code
 
 
-def _plan(args: argparse.Namespace) -> Reproduction:
-    from popgen.pipelines.reproduce import Plan, Reproduction
+def _plan(args: argparse.Namespace) -> Pieces:
+    from popgen.pipelines.reproduction_pieces import Pieces, Plan
     from popgen.reports.reproduction.target_registry import find_targets
     from popgen.runs.preflight import check_root
 
@@ -105,7 +106,7 @@ def _plan(args: argparse.Namespace) -> Reproduction:
         [Path(folder) for folder in args.runs],
         trains=not args.finished,
     )
-    return Reproduction(plan)
+    return Pieces(plan)
 
 
 def find_budget(name: str) -> Budget:
@@ -131,7 +132,7 @@ def _make_composer(shared: Sequence[str], config_dir: str | None) -> Any:
     everywhere = set().union(*fields.values())
 
     def compose_run(words: Sequence[str]) -> RunConfig:
-        method = dict(word.partition("=")[::2] for word in words)["method"]
+        method = next(word.partition("=")[2] for word in words if word.startswith("method="))
         foreign = everywhere - fields[method]
         kept = [word for word in words if word not in shared or word.partition("=")[0] not in foreign]
         config = RunConfig.parse(compose(kept, config_dir))
@@ -159,7 +160,7 @@ def _list_targets(args: argparse.Namespace) -> int:
     return OK
 
 
-def _print_state(work: Reproduction, args: argparse.Namespace) -> int:
+def _print_state(work: Pieces, args: argparse.Namespace) -> int:
     """What is done and what is left, and where the files are."""
     if not args.json:
         _print_screen(work, to_stderr=False)
@@ -175,7 +176,7 @@ def _print_state(work: Reproduction, args: argparse.Namespace) -> int:
     return OK
 
 
-def _print_screen(work: Reproduction, *, to_stderr: bool) -> None:
+def _print_screen(work: Pieces, *, to_stderr: bool) -> None:
     import sys
 
     import pandas as pd

@@ -42,7 +42,7 @@ def list_ego_lines(environment: str) -> list[PaperLine]:
     cells: dict[str, dict[str, float]] = defaultdict(dict)
     for cell in list_cells(environment):
         cells[cell.ego][f"beside {cell.holdout}"] = cell.mean
-    averages = dict(zip(EGOS, AVERAGES.get(environment, ()), strict=False))
+    averages: dict[str, float] = dict(zip(EGOS, AVERAGES.get(environment, ()), strict=False))
     return [PaperLine(f"E-{ego}", {**row, AVERAGE: averages[ego]}) for ego, row in cells.items()]
 
 

@@ -83,8 +83,14 @@ def to_section(record: Record, level: int = 2) -> str:
 
 
 def _wrap(text: str, start: str = "") -> str:
-    options = {"break_long_words": False, "break_on_hyphens": False}
-    return textwrap.fill(text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start), **options)
+    return textwrap.fill(
+        text,
+        WIDTH,
+        initial_indent=start,
+        subsequent_indent=" " * len(start),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _list_origins(record: Record) -> list[str]:

@@ -1,0 +1,233 @@
+"""What `popgen reproduce` is to make, and what of it is there: runs, measures, and an estimate of the rest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from popgen.config.run_config import RunConfig
+from popgen.durable_files import replace_file
+from popgen.pipelines.run_batch import named
+from popgen.reports.reproduction.target_records import Budget, Target, WantedRun
+from popgen.reports.run_record import differences, is_finished, planned_run, read_run
+
+MEASURE_SECONDS = 10.0
+"""That a measure takes, until one has been made."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be made.
+
+    Attributes:
+        targets, budget, seeds: as asked for.
+        out: folder of all pieces.
+        settings: given on top of the budget's, for all runs that have them.
+        command: that makes it again.
+        compose: overrides -> a checked configuration.
+        elsewhere: folders with finished runs that are taken instead of new ones.
+        trains: runs that are missing are made; without it what is finished is measured and told.
+    """
+
+    targets: Sequence[Target]
+    budget: Budget
+    seeds: Sequence[int]
+    out: Path
+    settings: Sequence[str]
+    command: str
+    compose: Callable[[Sequence[str]], RunConfig]
+    elsewhere: Sequence[Path] = ()
+    trains: bool = True
+
+
+@dataclass
+class Job:
+    """A run of the plan.
+
+    Attributes:
+        wanted: as its first target wants it.
+        folder: of the run.
+        config: of a population; None of an ego, whose partners' digests are known only once they are trained.
+        words: overrides, seed among them.
+        taken_over: the run is elsewhere.
+        measures: of all targets.
+        failed: why it is not there, after an attempt.
+    """
+
+    wanted: WantedRun
+    folder: Path
+    config: RunConfig | None
+    words: tuple[str, ...]
+    taken_over: bool = False
+    measures: list[str] = field(default_factory=list)
+    failed: str = ""
+
+    @property
+    def done(self) -> bool:
+        """The run is finished."""
+        return is_finished(self.folder)
+
+
+class Pieces:
+    """All pieces of a plan.
+
+    Args:
+        plan: what is to be made.
+
+    Raises:
+        UserError: a run that cannot work.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.jobs: dict[str, Job] = {}
+        self.wanted = {target.name: target.list_runs(plan.budget, plan.seeds) for target in plan.targets}
+        self._keys: dict[WantedRun, str] = {}
+        self._elsewhere = [read_run(path) for path in _find_runs(plan.elsewhere)]
+        for runs in self.wanted.values():
+            for run in runs:
+                self._add_job(run)
+
+    def find_job(self, run: WantedRun) -> Job:
+        """The job that makes a wanted run."""
+        return self.jobs[self._keys[run]]
+
+    def _add_job(self, run: WantedRun) -> Job:
+        for needed in run.needs:
+            self._add_job(needed)
+        if run not in self._keys:
+            job = self._make_job(run) if run.teacher is None else self._make_ego_job(run)
+            self._keys[run] = str(job.folder)
+            self.jobs.setdefault(str(job.folder), job)
+        job = self.find_job(run)
+        job.measures += [name for name in run.measures if name not in job.measures]
+        return job
+
+    def _make_job(self, run: WantedRun) -> Job:
+        words = (*run.words, f"seed={run.seed}", *self.plan.settings)
+        config = named(self.plan.compose(words), self.plan.out / "runs")
+        planned = planned_run(config)
+        for one in self._elsewhere:
+            same = (one.seed, len(one.members)) == (planned.seed, config.population.size)
+            rules = one.environment.fingerprint == planned.environment.fingerprint
+            if same and rules and one.method == planned.method and not differences(planned, one):
+                return Job(run, one.path, config, words, taken_over=True)
+        return Job(run, planned.path, config, words)
+
+    def _make_ego_job(self, run: WantedRun) -> Job:
+        assert run.teacher is not None
+        teacher = self.find_job(run.teacher)
+        words = (*run.words, f"seed={run.seed}")
+        digest = hashlib.sha256(" ".join((teacher.folder.name, *words)).encode()).hexdigest()[:8]
+        return Job(run, self.plan.out / "runs" / f"ego-{teacher.folder.name}-{digest}", None, words)
+
+    # What is there
+
+    def is_measured(self, job: Job, name: str) -> bool:
+        """A measure was made with as many episodes."""
+        return self.read_measured(job, name) is not None
+
+    def find_measured(self, job: Job, name: str) -> Path:
+        """The file of a measure."""
+        return self.plan.out / "measured" / f"{job.folder.name}.{name}.json"
+
+    def read_measured(self, job: Job, name: str) -> dict[str, Any] | None:
+        """Its figures; None where it is not there, or was made with other episodes or of another folder."""
+        values = read_json(self.find_measured(job, name))
+        same = values.get("episodes") == self.plan.budget.episodes and values.get("run") == str(job.folder)
+        return values["figures"] if same else None
+
+    def count_pieces(self, target: Target) -> dict[str, int]:
+        """Of a target: runs, runs done, measures, measures done."""
+        jobs = self.list_jobs(target)
+        own = [(self.find_job(run), name) for run in self.wanted[target.name] for name in run.measures]
+        measures = list({(str(job.folder), name): (job, name) for job, name in own}.values())
+        return {
+            "runs": len(jobs),
+            "runs_done": sum(job.done for job in jobs),
+            "measures": len(measures),
+            "measures_done": sum(self.is_measured(job, name) for job, name in measures),
+        }
+
+    def list_jobs(self, target: Target) -> list[Job]:
+        """Of a target, what its runs need first."""
+        found: dict[str, Job] = {}
+        for run in self.wanted[target.name]:
+            for one in (*run.needs, run):
+                job = self.find_job(one)
+                found[str(job.folder)] = job
+        return list(found.values())
+
+    def estimate_seconds(self, target: Target | None = None) -> float:
+        """That what is left will take: runs of the same kind as long as those that are done, others as the budget says;
+        of one target, or of all pieces once."""
+        jobs = list(self.jobs.values()) if target is None else self.list_jobs(target)
+        times: dict[str, list[float]] = {}
+        for job in self.jobs.values():
+            seconds = read_json(self.find_piece(job)).get("seconds")
+            if job.done and seconds is not None:
+                times.setdefault(_kind_of(job), []).append(seconds)
+        usual = 60 * self.plan.budget.minutes
+        left = sum(_average(times.get(_kind_of(job), []), usual) for job in jobs if not job.done)
+        todo = [name for job in jobs for name in job.measures if not self.is_measured(job, name)]
+        return left + MEASURE_SECONDS * len(todo) * (self.plan.budget.episodes / 20)
+
+    def find_piece(self, job: Job) -> Path:
+        """The file that says who made a run."""
+        return self.plan.out / "pieces" / f"{job.folder.name}.json"
+
+    def describe_command(self, job: Job) -> str:
+        """That makes the run."""
+        if job.wanted.teacher is None:
+            return " ".join(["popgen run", *job.words])
+        teacher = self.find_job(job.wanted.teacher).folder.name
+        return " ".join([f"popgen ego train {teacher}/population", *job.words])
+
+    def find_environment(self, run: WantedRun) -> str:
+        """Where it plays: an ego where its teacher does."""
+        job = self.find_job(run.teacher or run)
+        assert job.config is not None
+        return job.config.env.name
+
+    def list_failures(self) -> list[str]:
+        """Why pieces are not there, after an attempt."""
+        return [f"{job.wanted.row}, seed {job.wanted.seed}: {job.failed}" for job in self.jobs.values() if job.failed]
+
+
+def _find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Finished runs in folders and in theirs, without what a run keeps of itself."""
+    found = []
+    for folder in folders:
+        for depth in ("", "*/", "*/*/", "*/*/*/"):
+            found += [path.parent for path in sorted(folder.glob(f"{depth}config.json")) if is_finished(path.parent)]
+    return list(dict.fromkeys(found))
+
+
+def _kind_of(job: Job) -> str:
+    """Method, environment and size: runs alike in these take alike long."""
+    return "ego" if job.config is None else " ".join(word for word in job.words if word.split("=")[0] in _KINDS)
+
+
+_KINDS = ("method", "env", "population.size")
+
+
+def _average(values: Sequence[float], otherwise: float) -> float:
+    return sum(values) / len(values) if values else otherwise
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Empty for a file that is not there, or no JSON."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """In place of what was there, at once."""
+    replace_file(path, (json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
