@@ -61,6 +61,7 @@ class Player:
         digest: sha256 of its weights, None for a user's agent.
         make: () -> the policy.
         part: skill or role of a member of which its population has several kinds, "" elsewhere.
+        pair: number of the pair that it was trained in (HSP), 0 for a member that was trained with itself.
     """
 
     group: str
@@ -69,6 +70,7 @@ class Player:
     digest: str | None
     make: Callable[[], Policy]
     part: str = ""
+    pair: int = 0
 
     @property
     def name(self) -> str:
@@ -164,6 +166,7 @@ def _describe_population(label: str, population: Population) -> Group:
         Player(
             *(label, str(population.path), info.id, info.policy_sha256, _open_member(population, info.id)),
             part=str(info.extra.get("skill") or info.extra.get("role") or ""),
+            pair=_read_pair(info.extra),
         )
         for info in population.members
     )
@@ -171,6 +174,11 @@ def _describe_population(label: str, population: Population) -> Group:
     own = Lineage(manifest.method, manifest.seed, manifest.config_digest, digests)
     partners = [one for info in population.members for one in read_partners(str(population.path), info.extra)]
     return Group(label, manifest.method, players, (own,), tuple(dict.fromkeys(partners)))
+
+
+def _read_pair(extra: Mapping[str, Any]) -> int:
+    pair = extra.get("pair", 0)
+    return pair if type(pair) is int and "role" in extra else 0
 
 
 def _open_member(population: Population, member: int) -> Callable[[], Policy]:

@@ -81,10 +81,9 @@ def choose_most_distant(events: np.ndarray, count: int) -> list[int]:
     Raises:
         ValueError: more players wanted than there are.
     """
-    scaled = _scale_columns(events)
-    if not 1 <= count <= len(scaled):
-        raise ValueError(f"count: {count} of {len(scaled)} players cannot be chosen")
-    distance = np.abs(scaled[:, None] - scaled[None]).sum(-1)
+    distance = measure_distances(events)
+    if not 1 <= count <= len(distance):
+        raise ValueError(f"count: {count} of {len(distance)} players cannot be chosen")
     chosen = [int(distance.sum(1).argmax())]
     while len(chosen) < count:
         far = distance[chosen].sum(0)
@@ -93,13 +92,10 @@ def choose_most_distant(events: np.ndarray, count: int) -> list[int]:
     return sorted(chosen)
 
 
-def measure_spread(events: np.ndarray) -> float:
-    """Mean L1 distance between two players' event counts (K, F), in which each event's largest count is 1."""
+def measure_distances(events: np.ndarray) -> np.ndarray:
+    """(K, K) L1 distances between two players' event counts (K, F), in which each event's largest count is 1."""
     scaled = _scale_columns(events)
-    if len(scaled) < 2:
-        return 0.0
-    distance = np.abs(scaled[:, None] - scaled[None]).sum(-1)
-    return float(distance.sum() / (len(scaled) * (len(scaled) - 1)))
+    return np.abs(scaled[:, None] - scaled[None]).sum(-1)
 
 
 def _exchange_rows(gram: np.ndarray, chosen: list[int]) -> list[int]:

@@ -10,7 +10,8 @@ Keys of the JSON object (`diversity.json`):
     responses                how many of them have a best response
     over                     `members`, and `best responses` where all have one: determinant, log_determinant (null for
                              dependent partners), effective_rank, chosen (indices of partners), chosen_log_determinant,
-                             chosen_effective_rank, counts (a list of mean event counts for each partner)
+                             chosen_effective_rank, counts (a list of mean event counts for each partner), spreads (a
+                             list: group, part as below, value, low, high)
     actions                  a list for the populations whose members can tell their probabilities: group, part (`all`,
                              or the skill or role that its members have), members, entropy, own_entropy, actions,
                              trajectories (objects: value, low, high, in nats), most, kernel
@@ -31,7 +32,7 @@ from popgen.evaluation.action_diversity import MeasuredActions
 from popgen.evaluation.partner_diversity import PartnerDiversity
 from popgen.jsonable import jsonable
 from popgen.population.manifest import EnvironmentInfo
-from popgen.reports.frames import Sheet, number_text, to_csv
+from popgen.reports.frames import Sheet, number_text, range_text, to_csv
 
 CSV_FIELDS = ("over", "partner", "member", "chosen")
 """First columns of diversity.csv; a count for each kind of event follows."""
@@ -83,6 +84,7 @@ def _describe_one(one: PartnerDiversity) -> dict[str, Any]:
         "chosen_log_determinant": one.chosen_diversity.log_determinant,
         "chosen_effective_rank": one.chosen_diversity.effective_rank,
         "counts": one.counts.tolist(),
+        "spreads": [{"group": group, "part": part, **asdict(spread)} for (group, part), spread in one.spreads.items()],
     }
 
 
@@ -103,19 +105,33 @@ def make_sheet(report: Mapping[str, Any]) -> Sheet:
 
 def list_sheets(report: Mapping[str, Any]) -> list[Sheet]:
     """All tables of the report."""
-    return [make_sheet(report), *([make_actions_sheet(report)] if report["actions"] else [])]
+    actions = [make_actions_sheet(report)] if report["actions"] else []
+    return [make_sheet(report), make_spread_sheet(report), *actions]
+
+
+def make_spread_sheet(report: Mapping[str, Any]) -> Sheet:
+    """How far apart the members of a population are by what they do, over the same events."""
+    cells = [
+        {"over": name, "population": _name_part(one), "distance of two": range_text({**one, "mean": one["value"]})}
+        for name, found in report["over"].items()
+        for one in found["spreads"]
+    ]
+    return Sheet("Spread of events (two jackknife errors)", pd.DataFrame(cells), labels=2)
+
+
+def _name_part(one: Mapping[str, Any]) -> str:
+    return one["group"] if one["part"] == "all" else f"{one['group']}, {one['part']}"
 
 
 def make_actions_sheet(report: Mapping[str, Any]) -> Sheet:
     """A row for each population, and for each skill or role in it."""
     cells = []
     for one in report["actions"]:
-        whose = one["group"] if one["part"] == "all" else f"{one['group']}, {one['part']}"
         figures = {
             title: f"{one[name]['value']:.3f} ({one[name]['low']:.3f} to {one[name]['high']:.3f})"
             for name, title in _TITLES.items()
         }
-        cells.append({"population": whose, "members": str(one["members"]), **figures})
+        cells.append({"population": _name_part(one), "members": str(one["members"]), **figures})
     return Sheet("How differently members act, in nats (95 % interval)", pd.DataFrame(cells))
 
 

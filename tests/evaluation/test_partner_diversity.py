@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from support.scripted import ONE, STAY, TWO, Script, TallyEnv
 
 from popgen.envs import make_env
 from popgen.evaluation.holdout_players import Player
-from popgen.evaluation.partner_diversity import count_events, measure_partners
+from popgen.evaluation.partner_diversity import _find_mate, count_events, measure_partners
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 
 
@@ -26,6 +27,21 @@ def test_events_are_those_of_the_member_or_of_its_response() -> None:
     assert counts.tolist() == [[6, 0], [0, 6], [0, 0]] and steps == 3 * 2 * 2 * 6
     counts, _ = count_events(TallyEnv, partners, players([TWO], [TWO, STAY], [ONE]), 2, 0)  # type: ignore[arg-type]
     assert counts.tolist() == [[0, 6], [0, 3], [6, 0]]
+
+
+def test_those_of_a_pair_are_counted_beside_each_other_and_spread_by_role() -> None:
+    """ONE beside TWO in both seats, STAY beside ONE; three members of TWO kinds by role."""
+    made = players([ONE], [TWO], [STAY], [ONE], [TWO, STAY])
+    parts = [("biased", 1), ("partner", 1), ("biased", 2), ("partner", 2), ("biased", 0)]
+    paired = [replace(one, part=part, pair=pair) for one, (part, pair) in zip(made, parts, strict=True)]
+    assert [_find_mate(paired, k) for k in range(5)] == [1, 0, 3, 2, 4]
+    got = measure_partners(TallyEnv, paired, None, 1, 0)  # type: ignore[arg-type]
+    assert got.counts.tolist() == [[6, 0], [0, 6], [0, 0], [6, 0], [0, 3]]
+    assert set(got.spreads) == {("g", "all"), ("g", "biased"), ("g", "partner")}
+    assert got.spreads["g", "partner"].value == pytest.approx(2.0, rel=1e-3)
+    biased = got.spreads["g", "biased"]  # distances 1, 3/2 and 1/2: without one of them 1/2, 3/2 and 1
+    assert biased.value == pytest.approx(1.0, rel=1e-3)
+    assert biased.high - biased.value == pytest.approx(2 * math.sqrt(2 / 3 * 0.5), rel=1e-3)
 
 
 def test_the_most_diverse_are_chosen() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from popgen.play import event_diversity
-from popgen.play.event_diversity import choose_most_distant, choose_most_diverse, measure_diversity, measure_spread
+from popgen.play.event_diversity import choose_most_distant, choose_most_diverse, measure_distances, measure_diversity
 
 
 def test_br_div_of_orthogonal_and_of_equal_partners() -> None:
@@ -47,10 +47,10 @@ def test_the_most_distant_are_those_with_the_largest_sum_of_distances() -> None:
     assert choose_most_distant(events, 5) == [0, 1, 2, 3, 4]
 
 
-def test_spread_is_the_mean_distance_of_two() -> None:
-    """Distances of (0, 0), (1, 0), (1, 1): 1, 2 and 1."""
-    assert measure_spread(np.array([[0.0, 0.0], [2e6, 0.0], [2e6, 3e6]])) == pytest.approx(4 / 3, rel=1e-6)
-    assert measure_spread(np.ones((1, 2))) == 0.0
+def test_distances_are_of_counts_in_which_the_largest_is_1() -> None:
+    """Of (0, 0), (1, 0), (1, 1)."""
+    found = measure_distances(np.array([[0.0, 0.0], [2e6, 0.0], [2e6, 3e6]]))
+    np.testing.assert_allclose(found, [[0, 1, 2], [1, 0, 1], [2, 1, 0]], rtol=1e-6)
 
 
 def test_what_cannot_be_is_refused() -> None:
@@ -58,7 +58,7 @@ def test_what_cannot_be_is_refused() -> None:
         lambda: measure_diversity(np.array([[-1.0]])),
         lambda: choose_most_diverse(np.eye(3), 4),
         lambda: choose_most_distant(np.eye(3), 4),
-        lambda: measure_spread(np.zeros((2, 0))),
+        lambda: measure_distances(np.zeros((2, 0))),
     ):
         with pytest.raises(ValueError):
             call()
