@@ -93,7 +93,8 @@ class Game {
     this.canvas.width = told.columns * TILE;
     this.canvas.height = told.rows * TILE;
     this.canvas.style.aspectRatio = `${told.columns} / ${told.rows}`;
-    this.canvas.style.width = `${told.columns * TILE * 2}px`;
+    const room = `calc(max(10rem, 100vh - 15rem) * ${told.columns / told.rows})`; // the whole kitchen is in sight
+    this.canvas.style.width = `min(100%, ${told.columns * TILE * 3}px, ${room})`;
     this.seat.textContent = `You are cook ${told.seat + 1} (${told.seat ? "orange" : "blue"}).`;
     this.canvas.focus();
   }
