@@ -13,6 +13,7 @@ import numpy as np
 
 from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.evaluation.action_diversity import measure_groups
 from popgen.evaluation.convention_coverage import measure_coverage
 from popgen.evaluation.convention_effects import tabulate_effects
 from popgen.evaluation.crossplay import IDLE, RANDOM
@@ -29,7 +30,7 @@ from popgen.reports.comparison import default_thresholds, quality_costs
 from popgen.reports.holdout_report import to_dict
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_record import MemberRecord, RunRecord, read_run
-from popgen.types import Kind
+from popgen.types import FINAL_SKILL, Kind
 
 SEED = 0
 """Of evaluations; that of held ones is HELD_SEED."""
@@ -167,6 +168,25 @@ def measure_diversity(job: RunToMeasure) -> dict[str, Any]:
     return {"effective_rank": found.effective_rank, **({"log_determinant": log} if math.isfinite(log) else {})}
 
 
+def measure_acting(job: RunToMeasure) -> dict[str, Any]:
+    """How differently the members act (see `popgen.evaluation.action_diversity`), those of full skill where there are
+    several; nothing where they cannot tell their probabilities."""
+    opened = open_sides({"partner": [(None, str(job.folder))]}, title_of)
+    name, params = opened.environment.name, opened.environment.params
+
+    def make(num_envs: int, seed: int) -> Any:
+        return make_env(name, num_envs, seed=seed, **params)
+
+    measured = {one.part: one.found for one in measure_groups(make, opened.sides["partner"], job.episodes, SEED)}
+    if not measured:
+        return {}
+    found = measured[FINAL_SKILL if FINAL_SKILL in measured else "all"]
+    figures = {"members": found.members}
+    for name, interval in (("entropy", found.entropy), ("trajectories", found.trajectories)):
+        figures |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return figures
+
+
 def measure_ego(job: RunToMeasure) -> dict[str, Any]:
     """Score of an ego beside each held-out population, their mean, and its worst pair."""
     wanted = {"ego": [("ego", str(job.folder))], "partner": [(t, str(path)) for t, path in job.holdouts.items()]}
@@ -203,6 +223,7 @@ MEASURES: dict[str, Callable[[RunToMeasure], dict[str, Any]]] = {
     "held": measure_held,
     "sabotage": measure_exits,
     "diversity": measure_diversity,
+    "acting": measure_acting,
     "holdout": measure_ego,
     "conventions": measure_conventions,
 }

@@ -176,4 +176,5 @@ def test_measures_of_a_finished_run(tmp_path: Path) -> None:
     assert held["passed"] == 0 and "steps" not in held  # random players serve nothing
     assert run_measures.measure_exits(job) == {}  # nobody can leave a kitchen
     assert run_measures.measure_diversity(job)["effective_rank"] >= 1.0
+    assert run_measures.measure_acting(job) == {}  # random players tell no probabilities
     assert run_measures.round_figures({"a": [1.23456789, 2]}) == {"a": [1.23457, 2]}

@@ -134,6 +134,7 @@ HSP = Method(
     actors=list_actors,
     needs=estimate_hsp,
     check=check_hsp,
+    multiple=2,
 )
 
 BP = Method(
@@ -148,6 +149,7 @@ BP = Method(
     actors=list_actors,
     needs=estimate_hsp,
     check=check_hsp,
+    multiple=2,
 )
 
 E3T = Method(

@@ -115,7 +115,7 @@ def list_conventions(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
 def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     """A row for each method that makes populations, in which the egos that they taught stand too."""
     labels = [name for name, method in METHODS.items() if not method.trains_ego]
-    populations = want_runs(budget, seeds, labels, budget.layouts, [SCORES, COSTS, "diversity"])
+    populations = want_runs(budget, seeds, labels, budget.layouts, [SCORES, COSTS, "diversity", "acting"])
     return [*populations, *list_egos(budget, seeds)]
 
 

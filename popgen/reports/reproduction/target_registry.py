@@ -241,6 +241,8 @@ TARGETS = {
                 *_MIXED,
                 Column("BR-Div, log det", "diversity.log_determinant", 1),
                 Column("effective rank", "diversity.effective_rank", 1),
+                Column("entropy of the mean policy", "acting.entropy", 2),
+                Column("divergence of trajectories", "acting.trajectories", 2),
                 *_COSTS,
                 Column("its ego, average", "holdout.average"),
             ),
