@@ -85,6 +85,9 @@ class WorldModelConfig(Schema):
     """Weight of the KL that draws the posterior to the prior (eq. WM, KL balancing)."""
     free_nats: Weight = 1.0
     """KL in nats below which neither of the two is reduced."""
+    reward_head: Literal["events", "scalar"] = "events"
+    """What is predicted of a reward: `events`, the probability of each; `scalar`, the joint reward itself, as the mean
+    of a Gaussian (the paper's ablation)."""
     event_scale: Weight = 3.0
     """Weight of the events' (reward's) loss beside the observation's 1."""
     continue_scale: Weight = 1.0
@@ -211,7 +214,7 @@ _FILTER = (
     *("groups", "joint_groups", "classes", *_TRUNKS),
 )
 SHAPES: dict[str, tuple[str, ...]] = {
-    "world_model": (*_FILTER, "decoder_layers", "prior_layers", "head_layers"),
+    "world_model": (*_FILTER, "decoder_layers", "prior_layers", "head_layers", "reward_head"),
     "agent": (*_TRUNKS, "layers", "actor_input"),
 }
 """Fields that decide the shapes of the weights which a continued run takes over."""
@@ -381,6 +384,17 @@ class XpmWmRun(RunConfig):
     """What finds rare rewards and distrusts made-up ones."""
     watch: WatchConfig = WatchConfig()
     """When a run says that training goes wrong."""
+
+    @model_validator(mode="after")
+    def _check_reward_head(self) -> XpmWmRun:
+        """Discovery judges imagined events, which a scalar head does not tell."""
+        discovery = self.discovery
+        if self.world_model.reward_head == "scalar" and (
+            discovery.trust or discovery.rare_events or discovery.event_factors
+        ):
+            fix = "set discovery.trust, discovery.rare_events and discovery.event_factors to nothing"
+            raise UserError("world_model.reward_head", "is scalar, but discovery asks for imagined events", fix)
+        return self
 
     @model_validator(mode="after")
     def _check_windows(self) -> XpmWmRun:

@@ -39,9 +39,11 @@ def _compare_step(
     model: WorldModel, latent: Latent, obs: torch.Tensor, events: torch.Tensor, label: str
 ) -> dict[str, float]:
     spec = model.spec
+    figures = {f"exact_{label}": float(model.exact(model.decode(latent), obs).float().mean())}
+    if model.scalar:  # it tells no events
+        return figures
     logits = model.event_logits(latent).unflatten(-1, (spec.num_players, spec.num_events))
     counts = event_counts(logits.unsqueeze(0), events.unsqueeze(0), torch.ones(1, len(events), device=events.device))
-    figures = {f"exact_{label}": float(model.exact(model.decode(latent), obs).float().mean())}
     figures[f"event_precision_{label}"] = _share_of(counts["hits"].sum(), counts["predicted"].sum())
     figures[f"event_recall_{label}"] = _share_of(counts["hits"].sum(), counts["actual"].sum())
     for index, name in enumerate(spec.event_names):

@@ -2,7 +2,7 @@
 
     prior             z_t ~ p(. | h_t)
     decoder           o^i_t ~ p(. | h_t, z^i_t),  z^i = (z^joint, z^{p_i})
-    events            r_t ~ Bernoulli(. | h_t, z_t), one per event and player
+    events            r_t ~ Bernoulli(. | h_t, z_t), one per event and player; or a scalar reward, a Gaussian
     continue          c_t ~ Bernoulli(. | h_t, z_t)
 
 `popgen.methods.xpm_wm.latent_filter` has recurrent state and posterior, which is what acting needs and a predecessor
@@ -100,7 +100,8 @@ class WorldModel(nn.Module):
         style = layer_style(config)
         self.prior_net = mlp(config.deter, size, **style, layers=config.prior_layers)
         self.decoders = nn.ModuleList(PlayerDecoder(config, self.filter.view, inputs) for _ in range(2))
-        outputs = spec.num_events * spec.num_players
+        self.scalar = config.reward_head == "scalar"
+        outputs = 1 if self.scalar else spec.num_events * spec.num_players
         self.event_head = mlp(inputs, outputs, **style, layers=config.head_layers)
         self.continue_head = mlp(inputs, 1, **style, layers=config.head_layers)
         masks = player_masks(config.groups, config.joint_groups, config.classes)
@@ -161,8 +162,17 @@ class WorldModel(nn.Module):
         return probs * (probs > 0.5) if self.config.imagination == "mode" else probs
 
     def reward(self, latent: Latent) -> Float[Tensor, "*batch"]:
-        """Joint reward (...): w . p(r | h, z), summed over players (paper, "event-based rewards")."""
+        """Joint reward (...): w . p(r | h, z), summed over players ("event-based rewards"), or of a scalar head."""
+        if self.scalar:
+            return self.event_head(latent.flat()).squeeze(-1)
         return (self.event_probs(latent) * self.event_weights).sum(-1)
+
+    def reward_loss(self, latent: Latent, events: Float[Tensor, "T B PE"]) -> Float[Tensor, "T B"]:
+        """-ln p(r | h, z) of the events that led to states (T, B), or of their joint reward as a Gaussian of variance
+        1, up to a constant."""
+        if self.scalar:
+            return 0.5 * (self.reward(latent) - (events * self.event_weights).sum(-1)).square()
+        return event_loss(self.event_logits(latent), events)
 
     def continuation(self, latent: Latent) -> Float[Tensor, "*batch"]:
         """Probability (...) that the episode continues from this state."""
@@ -181,7 +191,8 @@ class WorldModel(nn.Module):
             decoder.output.copy_(bias)
         if self.filter.encoder.conv is not None:
             self.filter.encoder.center.copy_(obs_mean)
-        _last_bias(self.event_head).copy_(torch.logit(event_mean, eps=1e-3))
+        means = (event_mean * self.event_weights).sum(-1, keepdim=True) if self.scalar else None
+        _last_bias(self.event_head).copy_(torch.logit(event_mean, eps=1e-3) if means is None else means)
         _last_bias(self.continue_head).fill_(4.0)
 
     def exact(self, decoded: Tensor, obs: Tensor) -> Tensor:

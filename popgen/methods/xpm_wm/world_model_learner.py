@@ -20,7 +20,6 @@ from popgen.methods.xpm_wm.world_model import (
     WorldModel,
     balanced_kl,
     bernoulli_loss,
-    event_loss,
     masked_mean,
     predecessor_kl,
 )
@@ -109,14 +108,13 @@ class ModelLearner:
         seen = model.observe(batch.obs, batch.actions, batch.is_first, self.generator)
         inner = (~batch.is_first).float()
         decoded = model.decode(seen.latent)
-        events = model.event_logits(seen.latent)
         kl_loss, kl = balanced_kl(
             seen.posterior, seen.prior, dyn=config.kl_dyn, rep=config.kl_rep, free_nats=config.free_nats
         )
         going_on = bernoulli_loss(model.continue_head(seen.latent.flat()).squeeze(-1), 1.0 - batch.terminal)
         terms = {
             "observation": model.observation_loss(decoded, batch.obs).mean(),
-            "events": masked_mean(event_loss(events, batch.events.flatten(2)), inner),
+            "events": masked_mean(model.reward_loss(seen.latent, batch.events.flatten(2)), inner),
             "continue": going_on.mean(),
             "kl": masked_mean(kl_loss, inner),
             "predecessors": self._predecessor_loss(batch, seen),

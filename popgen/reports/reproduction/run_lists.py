@@ -25,7 +25,9 @@ KL = "world_model.kl_predecessors"
 SCORES, COSTS = "scores", "costs"
 
 
-def list_words(budget: Budget, label: str, environment: str, changes: Mapping[str, Any] | None = None) -> list[str]:
+def list_words(
+    budget: Budget, label: str, environment: str, changes: Mapping[str, Any] | None = None, size: int | None = None
+) -> list[str]:
     """Overrides of a run.
 
     Args:
@@ -33,10 +35,12 @@ def list_words(budget: Budget, label: str, environment: str, changes: Mapping[st
         label: `method` or `method:objective`.
         environment: registry name.
         changes: settings on top of all.
+        size: of its population, where it is not the budget's.
     """
     method = label.partition(":")[0]
     on_rendezvous = environment == RENDEZVOUS
     agents, each = budget.rendezvous_agents if on_rendezvous else budget.agents, METHODS[method].multiple
+    agents = agents if size is None else size
     settings = {**find_objective(label), **(changes or {})}
     return [
         *(f"method={method}", f"env={environment}", f"scale={budget.scale}"),
@@ -72,11 +76,14 @@ def want_variants(
     environment: str,
     variants: Mapping[str, Mapping[str, Any]],
     measures: Sequence[str],
+    size: int | None = None,
 ) -> list[WantedRun]:
     """Runs of one label that differ in some settings: what a row is called -> its settings."""
     title = title_of(label)
     return [
-        WantedRun(f"{title}: {name}", tuple(list_words(budget, label, environment, changes)), seed, tuple(measures))
+        WantedRun(
+            f"{title}: {name}", tuple(list_words(budget, label, environment, changes, size)), seed, tuple(measures)
+        )
         for seed in seeds
         for name, changes in variants.items()
     ]
@@ -131,6 +138,12 @@ def list_egos(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
                 words = (f"method={EGO}", f"scale={budget.scale}")
                 found.append(WantedRun(teacher.row, words, seed, ("holdout",), teacher, holdouts))
     return found
+
+
+def list_rewards(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """Agent 1 of XPM-WM with each head of the world model, in the ring alone."""
+    variants = {"event vector": {}, "scalar reward": {"world_model.reward_head": "scalar"}}
+    return want_variants(budget, seeds, MODEL, budget.ring, variants, ["curves", COSTS], size=1)
 
 
 def list_encoders(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:

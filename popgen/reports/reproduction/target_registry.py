@@ -181,6 +181,21 @@ TARGETS = {
             notes=("Wall-clock on a machine that other work may have shared: upper bounds.",),
         ),
         Target(
+            "vector-reward",
+            "A world model that predicts events, and one that predicts the reward",
+            'figure "With and without vectorized event-based reward prediction"',
+            "With a scalar reward XPM-WM's first agent learns nothing that is of use.",
+            run_lists.list_rewards,
+            (
+                Column("self-play of agent 1", "curves.first_final", 2),
+                Column("its steps", "costs.first", 0),
+                Column("minutes", "costs.minutes", 1),
+            ),
+            "draw_lines",
+            ("curves.first",),
+            notes=("The scalar head is a Gaussian's mean, as in the paper. Self-play of the run's own evaluation.",),
+        ),
+        Target(
             "shared-encoder",
             "An encoder that all agents share",
             'figure "XPM-Sim with and without the shared encoder"',
