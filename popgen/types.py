@@ -127,3 +127,10 @@ def check(array: Any, shape: Sequence[int | None], name: str) -> None:
     got = tuple(array.shape)
     if len(got) != len(shape) or any(want is not None and want != have for want, have in zip(shape, got, strict=True)):
         raise ValueError(f"{name}: expected shape {tuple(shape)}, got {got}")
+
+
+def check_reset(batch: int | None, rows: int) -> None:
+    """Raise RuntimeError unless a policy was reset for as many rows as it is to act on (None: never)."""
+    if batch != rows:
+        before = "nothing yet" if batch is None else f"{batch} rows"
+        raise RuntimeError(f"act on {rows} rows, but reset for {before}: call reset(batch={rows}, seed=...) first")

@@ -13,7 +13,7 @@ from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.humans.clone_inputs import NearestTargets
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.nets.weights import load_weights, weights_of
-from popgen.types import check
+from popgen.types import check, check_reset
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,7 @@ class ClonePolicy:
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """See `Policy.act`."""
         check(obs, (None, self._players, self._size), "obs")
+        check_reset(len(self._tried) or None, len(obs))
         self._follow(obs, previous_actions, is_first)
         logits = self.net(*self.inputs(obs)).numpy().reshape(len(obs), self._players, self._actions)
         bounds = self.probabilities(logits, self._left_out()).cumsum(-1)

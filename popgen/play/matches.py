@@ -157,8 +157,12 @@ class Seating:
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Continue from `state()` of the same seats and policies."""
         self._actions, self._first = np.array(state["actions"]), np.array(state["first"])
-        for k, policy in self._remembering_policies().items():
-            policy.load_memory(state["memories"][str(k)])
+        remembering = self._remembering_policies()
+        for k, rows in self._rows:
+            if k in remembering:
+                remembering[k].load_memory(state["memories"][str(k)])
+            else:  # nothing of it is in the state
+                self.policies[k].reset(len(rows), 0)
 
     def _remembering_policies(self) -> dict[int, Remembering]:
         seated = ((k, self.policies[k]) for k, _ in self._rows)

@@ -50,6 +50,9 @@ class Policy(Protocol):
 
         Returns:
             (B, P) uint8: column p is the action this policy would take in seat p.
+
+        Raises:
+            RuntimeError: `reset` was never called, or for another number of rows.
         """
         ...
 

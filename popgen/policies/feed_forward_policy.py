@@ -13,7 +13,7 @@ from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.nets.blocks import draw_by_multinomial
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.nets.weights import load_weights, weights_of
-from popgen.types import check
+from popgen.types import check, check_reset
 
 
 class FeedForwardSeat(nn.Module):
@@ -82,6 +82,7 @@ class FeedForwardPolicy:
             torch.manual_seed(seed)
             self.net = FeedForwardNet(view, num_actions, num_players, self.sizes)
         self._generator = torch.Generator().manual_seed(0)
+        self._batch: int | None = None
 
     def __repr__(self) -> str:
         return f"<FeedForwardPolicy on {self.view!r}, {sum(p.numel() for p in self.net.parameters()):,} weights>"
@@ -89,6 +90,7 @@ class FeedForwardPolicy:
     def reset(self, batch: int, seed: int) -> None:
         """Restart the generator; there is no memory."""
         self._generator.manual_seed(seed)
+        self._batch = batch
 
     def logits(self, obs: torch.Tensor) -> torch.Tensor:
         """Action logits (B, P, A) of joint observations (B, P, *view.shape)."""
@@ -99,6 +101,7 @@ class FeedForwardPolicy:
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """See `Policy.act`."""
         check(obs, (None, self._players, *self._shape), "obs")
+        check_reset(self._batch, len(obs))
         logits = self.logits(torch.from_numpy(np.ascontiguousarray(obs)))
         if self.greedy:
             return logits.argmax(-1).numpy().astype(np.uint8)

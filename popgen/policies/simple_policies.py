@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from popgen.envs.contract import EnvSpec
+from popgen.types import check_reset
 
 
 def _no_weights(weights: Mapping[str, np.ndarray]) -> None:
@@ -37,14 +38,16 @@ class RandomPolicy:
             if given.shape != (self.num_actions,) or not (given >= 0).all() or abs(given.sum() - 1.0) > 1e-6:
                 raise ValueError(f"probabilities must be {self.num_actions} non-negative numbers that sum to 1")
         self._rng = np.random.default_rng(0)
+        self._batch: int | None = None
 
     def reset(self, batch: int, seed: int) -> None:
         """Restart the generator; there is no memory."""
-        self._rng = np.random.default_rng(seed)
+        self._rng, self._batch = np.random.default_rng(seed), batch
 
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """Draw (B, P) actions; the observation counts for its batch size only."""
         size = obs.shape[:2]
+        check_reset(self._batch, len(obs))
         if self.probabilities is None:
             return self._rng.integers(0, self.num_actions, size, dtype=np.uint8)
         bounds = np.cumsum(self.probabilities)[:-1]  # the last bound may round to below 1
@@ -52,11 +55,11 @@ class RandomPolicy:
 
     def memory(self) -> dict[str, Any]:
         """The generator; see `popgen.play.policy.Remembering`."""
-        return {"generator": self._rng.bit_generator.state}
+        return {"generator": self._rng.bit_generator.state, "batch": self._batch}
 
     def load_memory(self, memory: dict[str, Any]) -> None:
         """Draw on from `memory()`."""
-        self._rng.bit_generator.state = memory["generator"]
+        self._rng.bit_generator.state, self._batch = memory["generator"], memory["batch"]
 
     def config(self) -> dict[str, Any]:
         """The action probabilities, None for uniform."""
@@ -88,12 +91,15 @@ class IdlePolicy:
         self.view = "features"
         self.action = action
         self._index = list(action_names).index(action)
+        self._batch: int | None = None
 
     def reset(self, batch: int, seed: int) -> None:
         """There is nothing to forget."""
+        self._batch = batch
 
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """(B, P) times the same action."""
+        check_reset(self._batch, len(obs))
         return np.full(obs.shape[:2], self._index, np.uint8)
 
     def config(self) -> dict[str, Any]:

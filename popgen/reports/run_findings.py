@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,7 +155,7 @@ def find_control(run: RunRecord, field: str) -> RunRecord | None:
 
 def next_commands(folder: str | Path, members: int) -> list[tuple[str, str]]:
     """Commands to go on with and what each does; `folder` is a run's or a population's."""
-    place = str(folder)
+    place = shlex.quote(str(folder))
     second = 2 if members > 1 else 1
     return [
         (f"popgen play {place} --watch 1 {second}", "watch members play"),

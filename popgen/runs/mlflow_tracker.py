@@ -13,7 +13,7 @@ import re
 import shlex
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -248,7 +248,7 @@ class Tracker:
         if self.config.uri is None:
             self.store.mkdir(parents=True, exist_ok=True)
         try:
-            with _lock_store(self.store, self.config.uri):
+            with _lock_store(self.store, self.config.uri), remove_stray_folder(self.uri):
                 self._client = MlflowClient(tracking_uri=self.uri)
                 self._experiment = _find_experiment(self._client, self.config, self.store)
             known = "parent" in self._runs
@@ -297,6 +297,17 @@ class Tracker:
             )
             return False
         return True
+
+
+@contextmanager
+def remove_stray_folder(uri: str) -> Iterator[None]:
+    """MLflow makes the folder of a sqlite address as it is spelled, which is another one where `?` is quoted."""
+    spelled = Path(uri.removeprefix("sqlite:///")).parent
+    stray = uri.startswith("sqlite:///") and not spelled.exists()
+    yield
+    if stray:
+        with suppress(OSError):  # a folder that holds the store is not empty
+            os.removedirs(spelled)
 
 
 class LocalTracker:

@@ -55,6 +55,22 @@ def test_every_kind_keeps_the_contract_and_survives_its_parts(kind: str, spec: E
     np.testing.assert_array_equal(played[0], played[2])
 
 
+@pytest.mark.parametrize("kind", sorted(POLICIES.keys() - {"human_clone"}))
+def test_every_kind_says_that_it_was_not_reset_or_for_another_batch(kind: str, spec: EnvSpec) -> None:
+    policy = example(kind, spec)
+    shape = spec.views[policy.view].shape
+
+    def act(rows: int) -> np.ndarray:
+        return policy.act(np.zeros((rows, 2, *shape), np.float32), np.zeros((rows, 2), np.uint8), np.ones(rows, bool))
+
+    with pytest.raises(RuntimeError, match=r"act on 3 rows, but reset for nothing yet: call reset\(batch=3, seed"):
+        act(3)
+    policy.reset(2, seed=0)
+    assert act(2).shape == (2, 2)
+    with pytest.raises(RuntimeError, match=r"act on 3 rows, but reset for 2 rows"):
+        act(3)
+
+
 @pytest.mark.parametrize(
     ("kind", "config", "weights", "told"),
     [
@@ -97,11 +113,13 @@ def test_random_follows_its_probabilities() -> None:
 
 def test_idle_plays_stay() -> None:
     policy = IdlePolicy(("north", "stay"))
+    policy.reset(2, seed=0)
     np.testing.assert_array_equal(policy.act(np.zeros((2, 2, 1)), np.zeros((2, 2)), np.ones(2)), np.ones((2, 2)))
 
 
 def test_feed_forward_sees_only_its_own_view_and_its_seat(spec: EnvSpec) -> None:
     policy = FeedForwardPolicy(spec.views["features"], spec.num_actions, greedy=True, seed=1)
+    policy.reset(64, seed=0)
     obs = np.random.default_rng(0).normal(size=(64, 2, *spec.views["features"].shape)).astype(np.float32)
     other = obs.copy()
     other[:, 1] = obs[:, 0]

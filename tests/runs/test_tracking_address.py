@@ -16,6 +16,7 @@ from sqlalchemy.engine import make_url
 
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.runs.mlflow_tracker import remove_stray_folder
 from popgen.runs.tracking_address import check_uri, sqlite_uri
 
 ODD = ["a?b", "a#b", "a%20b", "a%3Fb", "a b&c=d;e", "ü[x]", "100%", "u:p@host", "plain"]
@@ -33,6 +34,19 @@ def test_the_store_is_where_its_path_says(name: str, tmp_path: Path) -> None:
     engine.dispose()
     check_uri(uri)
     assert [path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()] == [Path(name, "mlflow.db")]
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_no_folder_is_left_beside_the_store(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mlflow.store.db.utils import _make_parent_dirs_if_sqlite as make_folder_as_spelled
+
+    monkeypatch.chdir(tmp_path)
+    store = tmp_path / name / "deep#er" / "mlflow.db"
+    store.parent.mkdir(parents=True)
+    store.touch()
+    with remove_stray_folder(sqlite_uri(store)):
+        make_folder_as_spelled(sqlite_uri(store))
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / name, store.parent, store]
 
 
 def test_a_plain_path_stays_readable() -> None:

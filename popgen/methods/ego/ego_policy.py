@@ -14,7 +14,7 @@ from popgen.methods.ego.ego_networks import EgoSizes, build_network
 from popgen.methods.ego.two_levels import draw_durations
 from popgen.nets.blocks import draw_by_gumbel
 from popgen.nets.weights import Weights, load_weights, weights_of
-from popgen.types import check
+from popgen.types import check, check_reset
 
 
 class EgoPolicy:
@@ -48,8 +48,7 @@ class EgoPolicy:
             RuntimeError: `reset` was for another batch.
         """
         check(obs, (None, self._players, *self.net.shape), "obs")
-        if len(obs) * self._players != len(self._state):
-            raise RuntimeError(f"reset(batch={len(obs)}, seed) before act on {len(obs)} rows")
+        check_reset(len(self._state) // self._players or None, len(obs))
         first = torch.from_numpy(np.repeat(np.asarray(is_first, bool), self._players))
         memory = self._encode_view(obs, previous_actions, first)
         logits = self._action_logits(memory, first)

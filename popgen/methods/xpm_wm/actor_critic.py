@@ -19,6 +19,7 @@ from popgen.methods.xpm_wm.latent_filter import Latent, player_masks
 from popgen.methods.xpm_wm.world_model import LatentFilter
 from popgen.nets import weights as w
 from popgen.nets.blocks import TwoHot, draw_by_inversion, mlp
+from popgen.types import check_reset
 
 
 class Actor(nn.Module):
@@ -156,10 +157,8 @@ class WorldModelPolicy:
 
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """(B, P) uint8 actions; see `Policy`."""
-        if self._latent is None or len(is_first) != len(self._latent.h):
-            before = "nothing yet" if self._latent is None else f"{len(self._latent.h)} rows"
-            problem = f"act on {len(is_first)} rows, but reset for {before}"
-            raise RuntimeError(f"{problem}: call reset(batch={len(is_first)}, seed=...) first")
+        check_reset(None if self._latent is None else len(self._latent.h), len(is_first))
+        assert self._latent is not None
         with torch.no_grad():
             self._latent = self.filter.filter(
                 self._latent,
