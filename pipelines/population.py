@@ -64,8 +64,8 @@ def run_population(config: RunConfig, *, reporter: Reporter) -> dict[str, Any]:
     Returns:
         run_id, run_dir, population (path), members (count), ledger (steps by member and kind), matrix and evaluation
         (`popgen.reports.crossplay_report`), warnings (what of it speaks against low cross-play, in sentences), tracking
-        (writer, command and address that show the run; None with tracking=off), findings (text and good: what the figures
-        mean), files (paths by name or suffix), seconds.
+        (writer, command and address that show the run; None with tracking=off), findings (text and good: what the
+        figures mean), files (paths by name or suffix), seconds.
 
     Raises:
         UserError: training diverged, the disk is (nearly) full, a checkpoint to continue from is damaged, another

@@ -19,7 +19,8 @@ def add(commands: Any) -> None:
         compare,
         "environment steps, time, SP/XP and steps to equal quality of finished runs, against the number of agents",
         "Runs of one method and environment are its seeds. Keys of --json: those of "
-        "popgen/reports/comparison_report (runs, costs, scores, quality, budgets, notes), files and tracking (command, address).",
+        "popgen/reports/comparison_report (runs, costs, scores, quality, budgets, notes), files and tracking (command, "
+        "address).",
     )
     parser.add_argument(
         "runs", nargs="*", type=named_path, metavar="[NAME=]RUN", help="a run's folder, called NAME and not its method"

@@ -39,7 +39,8 @@ def add(commands: Any) -> None:
         "the last lines name (evaluation.weak_share), 130 when interrupted. Keys of --json: run_id, run_dir, "
         "population (paths), members (how many), matrix (mean and standard_error, row = seat 0, column = seat 1), "
         "ledger (environment steps by member and kind), evaluation (as `evaluate --json`), weak_members (a line for "
-        "each that does not play), files (the report's), tracking (writer, command, address), seconds; with --dry-run the whole configuration.",
+        "each that does not play), files (the report's), "
+        "tracking (writer, command, address), seconds; with --dry-run the whole configuration.",
     )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings on top of conf/config.yaml")
     parser.add_argument(
