@@ -21,7 +21,9 @@ import time
 from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
+
+from filelock import BaseFileLock, FileLock, Timeout
 
 from popgen.config.run_config import RunConfig
 from popgen.durable_files import read_regular, replace_file
@@ -40,7 +42,8 @@ _STATE_TYPES: dict[str, Any] = {
 }
 _COLOURS = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _TAKEN = (errno.EAGAIN, errno.EACCES)
-_TRIES, _PAUSE = 40, 0.05  # a look at the lock holds it for a moment, and a killed process until it is gone
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP)
+_WAIT, _PAUSE = 2.0, 0.05  # a look at the lock holds it for a moment, and a killed process until it is gone
 _ACTIVE = ("metrics.jsonl", "ledger.jsonl", STATE)
 """Files that a living driver writes to: the last of these times is when an attempt was last heard of."""
 
@@ -78,16 +81,9 @@ class RunState:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.began, self._past, self._attempt = folder, time.time(), 0.0, 0
-        self._file = open(folder / LOCK, "a+", encoding="utf-8", errors="replace")  # noqa: SIM115 (held until the end)
-        if not _take_lock(self._file):
-            self._file.seek(0)
-            holder = self._file.read(200).strip() or "another process"
-            self._file.close()
-            problem = f"{folder.name} is being run by {holder}"
-            raise UserError("run.id", problem, "wait for it, stop it, or choose another id")
-        self._file.truncate(0)
-        self._file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        self._file.flush()
+        self._lock = FileLock(folder / LOCK, timeout=_WAIT, thread_local=False)
+        _take_lock(self._lock, folder)
+        (folder / LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
 
     @staticmethod
     def check_free(folder: Path) -> None:
@@ -115,7 +111,7 @@ class RunState:
 
     def release(self) -> None:
         """Give up the lock, for the next attempt of this process: the state stays what it is."""
-        self._file.close()
+        self._lock.release()
 
     def _write_state(self, state: str, error: str | None = None) -> None:
         now = time.time()
@@ -131,21 +127,23 @@ class RunState:
         replace_file(self.folder / STATE, json.dumps(values).encode())
 
 
-def _take_lock(file: TextIO) -> bool:
-    """Take the lock for the file's life; False if another process holds it.
+def _take_lock(lock: BaseFileLock, folder: Path) -> None:
+    """Hold it until it is released or the process has ended; no child inherits it.
 
-    A record lock: it belongs to the process, no child inherits it, and NFS carries it to other hosts. Where the file
-    system has no locks, nobody is kept out.
+    Where the file system has no locks, nobody is kept out.
+
+    Raises:
+        UserError: another driver holds it.
     """
-    for _ in range(_TRIES):
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        except OSError as error:
-            if error.errno not in _TAKEN:
-                return True
-        time.sleep(_PAUSE)
-    return False
+    try:
+        lock.acquire(poll_interval=_PAUSE)
+    except Timeout:
+        holder = (folder / LOCK).read_text(errors="replace")[:200].strip() or "another process"
+        problem = f"{folder.name} is being run by {holder}"
+        raise UserError("run.id", problem, "wait for it, stop it, or choose another id") from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
 
 
 def list_runs(root: Path) -> list[dict[str, Any]]:
@@ -222,10 +220,10 @@ def _present_state(folder: Path, state: dict[str, Any], done: bool) -> str:
 
 
 def _is_alive(lock: Path, state: dict[str, Any]) -> bool:
-    """Is the driver at work? Not to be asked by the driver's own process, whose lock it would end."""
+    """Is the driver at work? A look changes nothing, and needs no right to write: a lock of its own would take both."""
     try:
         with open(lock, "rb") as file:
-            fcntl.lockf(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return False
     except FileNotFoundError:
         return False

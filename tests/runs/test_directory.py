@@ -101,6 +101,16 @@ def test_a_driver_that_is_killed_leaves_an_interrupted_run_that_can_be_taken_up(
     assert (describe_run(folder)["state"], describe_run(folder)["attempt"]) == ("finished", 2)
 
 
+def test_one_process_has_a_run_once_and_reading_its_files_does_not_end_that(folder: Path) -> None:
+    state = RunState(folder)
+    with (folder / runs.LOCK).open():
+        pass  # a record lock would end here
+    with pytest.raises(UserError, match=f"first is being run by process {os.getpid()}"):
+        RunState(folder)
+    state.release()
+    RunState(folder).release()
+
+
 def test_looking_at_a_run_does_not_end_its_lock(folder: Path, elsewhere: Any) -> None:
     for _ in range(20):
         assert describe_run(folder)["state"] == "running"
@@ -136,6 +146,7 @@ def test_seconds_are_those_of_all_attempts(folder: Path, monkeypatch: pytest.Mon
     first.start(1)
     for name in ("state.json", "ledger.jsonl"):  # it is killed, 40 s after it began last heard of
         os.utime(folder / name, (1040, 1040))
+    first.release()
     assert describe_run(folder)["seconds"] == 40
     now = 2000.0
     second = RunState(folder)
@@ -232,7 +243,7 @@ def test_where_there_are_no_locks_the_process_is_looked_for(folder: Path, monkey
     def no_locks(*_: Any) -> None:
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr(runs.fcntl, "lockf", no_locks)
+    monkeypatch.setattr(runs.fcntl, "flock", no_locks)
     RunState(folder).start(1)
     assert describe_run(folder)["state"] == "running"
     values = json.loads((folder / "state.json").read_text())

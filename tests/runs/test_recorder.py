@@ -68,6 +68,7 @@ def test_half_a_point_is_dropped_and_repeated_points_count_once(tmp_path: Path) 
         first.record_metrics(1, step, real_sp=score)
     path = tmp_path / "r" / "metrics.jsonl"
     path.write_text(path.read_text() + '{"member": 1, "st')
+    first.state.release()  # as the system does when a process dies
     second = recorder(tmp_path)
     for step, score in ((200, 2.5), (350, 4.0)):  # it goes on after step 100
         second.record_metrics(1, step, real_sp=score)
