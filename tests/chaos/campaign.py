@@ -1,6 +1,6 @@
 """A campaign of random faults: `make chaos`, or `python tests/chaos/campaign.py --faults 36 --seed 1`.
 
-Small runs with schedule=sync, each hit by one fault at a random moment. Each must end complete, by itself or when it is
+Small runs with schedule=sync, each with one fault at a random moment. Each must end complete, by itself or when it is
 submitted again, with the ledger and the weights of the run that nothing happened to. Prints one line for each fault
 and ends with exit code 1 if one of them was not survived.
 """
@@ -15,8 +15,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from faults import FAULTS, Fault, Hit
-from site_of_chaos import RunRecorder, Site, events, repeated
+from chaos_testbed import RunFigures, Testbed, count_events, count_repeated_steps
+from faults import FAULTS, Fault, Trial
 
 TRIES = 5
 """Of a fault whose run ended before its moment came."""
@@ -24,23 +24,23 @@ TRIES = 5
 
 def main() -> int:
     """Run the campaign; 0 if all faults were survived."""
-    args = arguments()
-    site = Site.open()
+    args = read_arguments()
+    testbed = Testbed.open()
     began, rows = time.time(), []
     try:
-        references = {method: reference(site, method) for method in args.methods}
-        plan = schedule(args, random.Random(args.seed))
+        references = {method: run_undisturbed(testbed, method) for method in args.methods}
+        plan = plan_faults(args, random.Random(args.seed))
         for number, (method, fault) in enumerate(plan, start=1):
             rows.append(
-                strike(site, number, method, fault, references[method], random.Random(args.seed * 1000 + number))
+                run_trial(testbed, number, method, fault, references[method], random.Random(args.seed * 1000 + number))
             )
-            print(line(rows[-1]), flush=True)
+            print(format_row(rows[-1]), flush=True)
     finally:
-        site.close(keep=not all(row["survived"] for row in rows))
-    return summary(rows, time.time() - began, args.json)
+        testbed.close(keep=not all(row["survived"] for row in rows))
+    return print_summary(rows, time.time() - began, args.json)
 
 
-def arguments() -> argparse.Namespace:
+def read_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=36, help="how many (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of kinds, moments and victims (%(default)s)")
@@ -50,87 +50,92 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def schedule(args: argparse.Namespace, rng: random.Random) -> list[tuple[str, Fault]]:
-    """As many faults of each kind, in random order, each on the next method that has what it hits."""
+def plan_faults(args: argparse.Namespace, rng: random.Random) -> list[tuple[str, Fault]]:
+    """As many faults of each kind, in random order, each on the next method that it applies to."""
     kinds = [args.kinds[number % len(args.kinds)] for number in range(args.faults)]
     rng.shuffle(kinds)
     plan, turn = [], Counter()
     for kind in kinds:
-        able = [method for method in args.methods if FAULTS[kind].hits(method)]
+        able = [method for method in args.methods if FAULTS[kind].applies(method)]
         if able:
             plan.append((able[turn[kind] % len(able)], FAULTS[kind]))
             turn[kind] += 1
     return plan
 
 
-def reference(site: Site, method: str) -> dict[str, Any]:
+def run_undisturbed(testbed: Testbed, method: str) -> dict[str, Any]:
     """The run that nothing happens to."""
     began, name = time.time(), f"{method}-undisturbed"
-    run, log = site.folder / "runs" / name, site.folder / f"{name}.out"
-    outcome = site.finish(site.start(site.overrides(name, f"method={method}", "tracking=off"), log), log)
+    run, log = testbed.folder / "runs" / name, testbed.folder / f"{name}.out"
+    outcome = testbed.finish(testbed.start(testbed.list_settings(name, f"method={method}", "tracking=off"), log), log)
     if outcome.code:
         raise SystemExit(f"the undisturbed run of {method} ended with {outcome.code}: {outcome.error}")
     print(
-        f"{name}: {time.time() - began:.0f} s, {events(run)} events, {RunRecorder.of(run).totals['total']}", flush=True
+        f"{name}: {time.time() - began:.0f} s, {count_events(run)} events, {RunFigures.read(run).totals['total']}",
+        flush=True,
     )
-    # A machine that is short of memory hits even this run; what it did again is no moment of its own.
+    # A machine that is short of memory disturbs even this run; what it did again is no moment of its own.
     rows = [json.loads(text) for text in (run / "run.log").read_text().splitlines()]
     moments = {(row["event"], row.get("member"), row.get("iteration"), row.get("text")) for row in rows}
-    return {"recorder": RunRecorder.of(run), "events": len(moments)}
+    return {"figures": RunFigures.read(run), "events": len(moments)}
 
 
-def strike(
-    site: Site, number: int, method: str, fault: Fault, known: dict[str, Any], rng: random.Random
+def run_trial(
+    testbed: Testbed, number: int, method: str, fault: Fault, known: dict[str, Any], rng: random.Random
 ) -> dict[str, Any]:
-    """One fault: the run, what hit it and when, and what came of it."""
+    """One fault on one run: where and when it was injected, and what came of it."""
     for attempt in range(TRIES):
         name = f"{number:03d}-{fault.name.replace(chr(32), chr(45))}-{attempt}"
         moment = rng.randrange(2, known["events"])
-        hit = Hit(site, name, method, moment, rng.random() * fault.delay, rng)
+        trial = Trial(testbed, name, method, moment, rng.random() * fault.delay, rng)
         began = time.time()
-        fault.act(hit)
-        if hit.struck:
+        fault.act(trial)
+        if trial.injected:
             break
-    row = {"number": number, "method": method, "fault": fault.name, "event": moment, "victim": hit.victim}
-    row |= {"submissions": hit.submissions, "told": hit.told, "seconds": round(time.time() - began, 1)}
-    run = hit.run
-    row |= {"struck": hit.struck, "attempts": 0, "repeated": 0}
-    if not hit.struck or hit.code:
-        problem = f"exit {hit.code}: {hit.told}" if hit.code else f"the run ended before it, {TRIES} times"
+    row = {"number": number, "method": method, "fault": fault.name, "event": moment, "victim": trial.victim}
+    row |= {
+        "submissions": trial.submissions,
+        "error_lines": trial.error_lines,
+        "seconds": round(time.time() - began, 1),
+    }
+    run = trial.run
+    row |= {"injected": trial.injected, "attempts": 0, "repeated": 0}
+    if not trial.injected or trial.code:
+        problem = f"exit {trial.code}: {trial.error_lines}" if trial.code else f"the run ended before it, {TRIES} times"
         return row | {"survived": False, "problem": problem}
-    recorder, wanted = RunRecorder.of(run), known["recorder"]
-    problems = [what for what in ("weights", "entries", "totals") if getattr(recorder, what) != getattr(wanted, what)]
-    problems += ["error text"] * (fault.one_line and not one_line(hit.told))
+    figures, wanted = RunFigures.read(run), known["figures"]
+    problems = [what for what in ("weights", "entries", "totals") if getattr(figures, what) != getattr(wanted, what)]
+    problems += ["error text"] * (fault.one_line and not one_line(trial.error_lines))
     attempts = len((run / "attempts.txt").read_text().splitlines())
-    row |= {"attempts": attempts, "repeated": repeated(run), "weights": recorder.weights[-1][:12]}
+    row |= {"attempts": attempts, "repeated": count_repeated_steps(run), "weights": figures.weights[-1][:12]}
     return row | {"survived": not problems, "problem": ", ".join(problems)}
 
 
-def one_line(told: list[str]) -> bool:
+def one_line(error_lines: list[str]) -> bool:
     """The interrupted call ended with one line, and no traceback."""
-    return bool(told) and all(text.startswith("popgen: error: ") and " / " not in text for text in told)
+    return bool(error_lines) and all(text.startswith("popgen: error: ") and " / " not in text for text in error_lines)
 
 
-def line(row: dict[str, Any]) -> str:
+def format_row(row: dict[str, Any]) -> str:
     """Of the table."""
-    failed = f"{'FAILED' if row['struck'] else 'missed'} ({row['problem']})"
+    failed = f"{'FAILED' if row['injected'] else 'missed'} ({row['problem']})"
     verdict = "survived" if row["survived"] else failed
     parts = (f"{row['number']:3d}", f"{row['method']:8s}", f"{row['fault']:22s}", f"after event {row['event']:3d}")
     more = (f"{row['attempts']} attempts", f"{row['submissions']} calls", f"{row['repeated']:5d} steps again")
     return "  ".join([*parts, *more, f"{row['seconds']:5.0f} s", verdict, str(row["victim"])])
 
 
-def summary(rows: list[dict[str, Any]], seconds: float, path: Path | None) -> int:
-    """What the campaign found; the exit code. A fault that missed its run says nothing, and is told apart."""
-    struck = [row for row in rows if row["struck"]]
-    survived, kinds = sum(row["survived"] for row in struck), Counter(row["fault"] for row in struck)
-    missed = f", {len(rows) - len(struck)} more missed their runs" if len(struck) < len(rows) else ""
+def print_summary(rows: list[dict[str, Any]], seconds: float, path: Path | None) -> int:
+    """What the campaign found; the exit code. A fault that missed its run says nothing, and is counted apart."""
+    injected = [row for row in rows if row["injected"]]
+    survived, kinds = sum(row["survived"] for row in injected), Counter(row["fault"] for row in injected)
+    missed = f", {len(rows) - len(injected)} more missed their runs" if len(injected) < len(rows) else ""
     took = f"in {seconds / 60:.1f} minutes"
-    print(f"{survived} of {len(struck)} faults of {len(kinds)} kinds survived {took}{missed}", flush=True)
+    print(f"{survived} of {len(injected)} faults of {len(kinds)} kinds survived {took}{missed}", flush=True)
     if path is not None:
         path.write_text(json.dumps(rows, indent=1))
-    whole = all(row["survived"] or not (row["struck"] or row["told"]) for row in rows)
-    return 0 if struck and whole else 1
+    whole = all(row["survived"] or not (row["injected"] or row["error_lines"]) for row in rows)
+    return 0 if injected and whole else 1
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
-from site_of_chaos import FAR, Site, end, events, until
+from chaos_testbed import SECOND, Testbed, count_events, send_signal, wait_until
 
 ACTORS = {
     "sampler": {"xpm_wm": "SamplerActor", "xpm_sim": "SamplerActor", "default": "Runner"},
@@ -25,20 +25,20 @@ ACTORS = {
 
 
 @dataclass
-class Hit:
+class Trial:
     """One fault on one run: where, when, and what came of it."""
 
-    site: Site
+    testbed: Testbed
     name: str
     method: str
     moment: int
     delay: float
     rng: random.Random
-    struck: bool = False
+    injected: bool = False
     victim: str = ""
     code: int = 0
     submissions: int = 0
-    told: list[str] = field(default_factory=list)
+    error_lines: list[str] = field(default_factory=list)
     root: Path | None = None
     more: tuple[str, ...] = ()
     place: tuple[str, ...] = ()
@@ -46,32 +46,34 @@ class Hit:
 
     @property
     def run(self) -> Path:
-        return (self.root or self.site.folder / "runs") / self.name
+        return (self.root or self.testbed.folder / "runs") / self.name
 
     def start(self, *more: str) -> subprocess.Popen[bytes]:
         """Submit the run (again)."""
         self.submissions += 1
         given = (f"method={self.method}", f"tracking={self.tracking}", *self.more, *more)
-        return self.site.start(self.site.overrides(self.name, *given, root=self.root, place=self.place), self._log)
+        return self.testbed.start(
+            self.testbed.list_settings(self.name, *given, root=self.root, place=self.place), self._log
+        )
 
     def wait(self, process: subprocess.Popen[bytes]) -> int:
-        """For the driver's end; what it told is kept."""
-        outcome = self.site.finish(process, self._log)
+        """For the driver's end; its lines on stderr are kept."""
+        outcome = self.testbed.finish(process, self._log)
         self.code = outcome.code
         if outcome.error:
-            self.told.append(outcome.error)
+            self.error_lines.append(outcome.error)
         return outcome.code
 
-    def reached(self, process: subprocess.Popen[bytes]) -> bool:
+    def wait_for_moment(self, process: subprocess.Popen[bytes]) -> bool:
         """Wait for the moment; False if the run ends before."""
-        if not until(lambda: events(self.run) >= self.moment, process):
+        if not wait_until(lambda: count_events(self.run) >= self.moment, process):
             return False
         time.sleep(self.delay)
         return process.poll() is None
 
     @property
     def _log(self) -> Path:
-        return self.site.folder / f"{self.name}.{self.submissions}.out"
+        return self.testbed.folder / f"{self.name}.{self.submissions}.out"
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,8 @@ class Fault:
     """A kind of fault; delay: seconds at most that it comes after its event; one_line: its first call ends with one."""
 
     name: str
-    act: Callable[[Hit], None]
-    hits: Callable[[str], bool] = lambda method: True
+    act: Callable[[Trial], None]
+    applies: Callable[[str], bool] = lambda method: True
     delay: float = 0.4
     one_line: bool = False
 
@@ -88,126 +90,126 @@ class Fault:
 def kill_actor(role: str) -> Fault:
     """kill -9 of one of the run's actors: the driver goes on by itself."""
 
-    def act(hit: Hit) -> None:
-        process = hit.start()
-        pattern = ACTORS[role].get(hit.method) or ACTORS[role]["default"]
-        if hit.reached(process):
-            strike_actor(hit, process, pattern)
-        hit.wait(process)
+    def act(trial: Trial) -> None:
+        process = trial.start()
+        pattern = ACTORS[role].get(trial.method) or ACTORS[role]["default"]
+        if trial.wait_for_moment(process):
+            kill_actor_process(trial, process, pattern)
+        trial.wait(process)
 
     return Fault(role, act, lambda method: method in ACTORS[role] or "default" in ACTORS[role])
 
 
-def strike_actor(hit: Hit, process: subprocess.Popen[bytes], pattern: str) -> None:
-    found = until(lambda: hit.site.workers(pattern), process)
+def kill_actor_process(trial: Trial, process: subprocess.Popen[bytes], pattern: str) -> None:
+    found = wait_until(lambda: trial.testbed.find_actors(pattern), process)
     if found:
-        victim = hit.rng.choice(found)
-        hit.victim = " ".join(victim.cmdline())
-        end(victim)
-        hit.struck = True
+        victim = trial.rng.choice(found)
+        trial.victim = " ".join(victim.cmdline())
+        send_signal(victim)
+        trial.injected = True
 
 
-def kill_tracker(hit: Hit) -> None:
+def kill_tracker(trial: Trial) -> None:
     """kill -9 of the tracker: the run goes on, and MLflow has every point once."""
-    hit.tracking = "sqlite"
-    process = hit.start()
-    if hit.reached(process):
-        strike_actor(hit, process, "TrackerActor")
-    if hit.wait(process) == 0 and hit.struck:
-        check_tracking(hit)
+    trial.tracking = "mlflow"
+    process = trial.start()
+    if trial.wait_for_moment(process):
+        kill_actor_process(trial, process, "TrackerActor")
+    if trial.wait(process) == 0 and trial.injected:
+        check_tracking(trial)
 
 
-def check_tracking(hit: Hit) -> None:
+def check_tracking(trial: Trial) -> None:
     """One parent and a nested run for each member, all finished, with as many points as metrics.jsonl."""
     import json
     import sqlite3
 
-    with sqlite3.connect(hit.run.parent / "mlflow.db") as store:
-        own = f"run_uuid in (select run_uuid from tags where key = 'popgen.run' and value = '{hit.run.name}')"
+    with sqlite3.connect(trial.run.parent / "mlflow.db") as store:
+        own = f"run_uuid in (select run_uuid from tags where key = 'popgen.run' and value = '{trial.run.name}')"
         runs = store.execute(f"select count(*), sum(status = 'FINISHED') from runs where {own}").fetchone()
         points = store.execute(f"select count(*) from metrics where key = 'real_sp' and {own}").fetchone()[0]
-    rows = [json.loads(text) for text in (hit.run / "metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(text) for text in (trial.run / "metrics.jsonl").read_text().splitlines()]
     wanted = sum("real_sp" in row for row in rows)
     if runs != (3, 3) or points != wanted:
-        hit.code = 1
-        hit.told.append(f"MLflow has {runs} runs and {points} of {wanted} points")
+        trial.code = 1
+        trial.error_lines.append(f"MLflow has {runs} runs and {points} of {wanted} points")
 
 
-def signal_driver(number: signal.Signals) -> Callable[[Hit], None]:
+def signal_driver(number: signal.Signals) -> Callable[[Trial], None]:
     """A signal to the driver; the same run id is submitted again."""
 
-    def act(hit: Hit) -> None:
-        process = hit.start()
-        if hit.reached(process):
-            hit.victim, hit.struck = "driver", True
-            end(psutil.Process(process.pid), number)
-        if process.wait(timeout=120) != 0 and hit.struck:
-            hit.wait(hit.start())
-        elif not hit.struck:
-            hit.wait(process)
+    def act(trial: Trial) -> None:
+        process = trial.start()
+        if trial.wait_for_moment(process):
+            trial.victim, trial.injected = "driver", True
+            send_signal(psutil.Process(process.pid), number)
+        if process.wait(timeout=120) != 0 and trial.injected:
+            trial.wait(trial.start())
+        elif not trial.injected:
+            trial.wait(process)
 
     return act
 
 
-def kill_node(hit: Hit) -> None:
+def kill_node(trial: Trial) -> None:
     """kill -9 of the node that all actors are on; another one comes."""
-    if hit.site.node is None:
-        hit.site.add_node()
-    hit.place = (f"cluster.address={hit.site.cluster.address}", f"cluster.resources.{FAR}=1")
-    process = hit.start()
-    if hit.reached(process):
-        hit.site.remove_node()
-        hit.site.add_node()
-        hit.victim, hit.struck = "node", True
-    hit.wait(process)
+    if trial.testbed.node is None:
+        trial.testbed.add_node()
+    trial.place = (f"cluster.address={trial.testbed.cluster.address}", f"cluster.resources.{SECOND}=1")
+    process = trial.start()
+    if trial.wait_for_moment(process):
+        trial.testbed.remove_node()
+        trial.testbed.add_node()
+        trial.victim, trial.injected = "node", True
+    trial.wait(process)
 
 
-def kill_local(name: str) -> Callable[[Hit], None]:
+def kill_local(name: str) -> Callable[[Trial], None]:
     """kill -9 of a process of the driver's own Ray: the driver starts another one, or is made again where Ray's library
     ended it."""
 
-    def act(hit: Hit) -> None:
-        hit.place = ("cluster=laptop", "cluster.num_cpus=4")
-        process = hit.start()
-        if hit.reached(process):
+    def act(trial: Trial) -> None:
+        trial.place = ("cluster=laptop", "cluster.num_cpus=4")
+        process = trial.start()
+        if trial.wait_for_moment(process):
             for child in psutil.Process(process.pid).children(recursive=True):
                 if child.name() == name:
-                    hit.victim, hit.struck = name, True
-                    end(child)
+                    trial.victim, trial.injected = name, True
+                    send_signal(child)
                     break
-        hit.wait(process)
+        trial.wait(process)
 
     return act
 
 
-def fill_disk(reserve: int) -> Callable[[Hit], None]:
+def fill_disk(reserve: int) -> Callable[[Trial], None]:
     """The file system of the run is full, or nearly; room is made, and the run submitted again."""
 
-    def act(hit: Hit) -> None:
-        hit.root = hit.site.folder / f"disk-{hit.name}"
-        hit.root.mkdir()
-        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600m", "tmpfs", str(hit.root)], check=True)
+    def act(trial: Trial) -> None:
+        trial.root = trial.testbed.folder / f"disk-{trial.name}"
+        trial.root.mkdir()
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600m", "tmpfs", str(trial.root)], check=True)
         try:
-            hit.more = ("replay.capacity=20000", f"run.disk_reserve={reserve}")
-            process = hit.start()
-            if hit.reached(process):
-                hit.victim, hit.struck = "disk", True
-                fill(hit.root / "ballast", leave=reserve // 2)
-            if hit.wait(process) == 2:
-                (hit.root / "ballast").unlink(missing_ok=True)
-                hit.wait(hit.start())
+            trial.more = ("replay.capacity=20000", f"run.disk_reserve={reserve}")
+            process = trial.start()
+            if trial.wait_for_moment(process):
+                trial.victim, trial.injected = "disk", True
+                fill_file(trial.root / "ballast", leave=reserve // 2)
+            if trial.wait(process) == 2:
+                (trial.root / "ballast").unlink(missing_ok=True)
+                trial.wait(trial.start())
             else:
-                hit.struck = False  # it needed no more room
-            kept = hit.site.folder / "runs" / hit.name
-            shutil.copytree(hit.run, kept)
+                trial.injected = False  # it needed no more room
+            kept = trial.testbed.folder / "runs" / trial.name
+            shutil.copytree(trial.run, kept)
         finally:
-            subprocess.run(["umount", "-l", str(hit.root)], check=False)
-        hit.root = None
+            subprocess.run(["umount", "-l", str(trial.root)], check=False)
+        trial.root = None
 
     return act
 
 
-def fill(path: Path, leave: int) -> None:
+def fill_file(path: Path, leave: int) -> None:
     """A file that takes all room but `leave` bytes."""
     with path.open("wb", buffering=0) as file:
         try:
@@ -217,35 +219,35 @@ def fill(path: Path, leave: int) -> None:
             return
 
 
-def damage_checkpoint(hit: Hit) -> None:
+def damage_checkpoint(trial: Trial) -> None:
     """The driver is killed and a bit of the newest checkpoint turned: the one before it counts."""
-    process = hit.start()
-    folder = hit.run / "checkpoints"
-    if hit.reached(process) and until(lambda: len(list(folder.glob("progress_*[0-9]"))) == 2, process):
-        end(psutil.Process(process.pid))
+    process = trial.start()
+    folder = trial.run / "checkpoints"
+    if trial.wait_for_moment(process) and wait_until(lambda: len(list(folder.glob("progress_*[0-9]"))) == 2, process):
+        send_signal(psutil.Process(process.pid))
     process.wait(timeout=120)
     found = sorted(folder.glob("progress_*[0-9]"))
     if process.returncode != 0 and len(found) == 2:
-        path = found[-1] / hit.rng.choice(["arrays.safetensors", "values.json"])
+        path = found[-1] / trial.rng.choice(["arrays.safetensors", "values.json"])
         data = bytearray(path.read_bytes())
-        data[hit.rng.randrange(len(data))] ^= 1 << hit.rng.randrange(8)
+        data[trial.rng.randrange(len(data))] ^= 1 << trial.rng.randrange(8)
         path.write_bytes(data)
-        hit.victim, hit.struck = f"{found[-1].name}/{path.name}", True
-    hit.wait(hit.start())
+        trial.victim, trial.injected = f"{found[-1].name}/{path.name}", True
+    trial.wait(trial.start())
 
 
-def lose_machine(hit: Hit) -> None:
+def lose_machine(trial: Trial) -> None:
     """The driver is killed and the run's folder gone: it comes back from the storage."""
-    hit.more = (f"run.storage=file://{hit.site.folder}/storage",)
-    process = hit.start()
-    if hit.reached(process):
-        end(psutil.Process(process.pid))
+    trial.more = (f"run.storage=file://{trial.testbed.folder}/storage",)
+    process = trial.start()
+    if trial.wait_for_moment(process):
+        send_signal(psutil.Process(process.pid))
         process.wait(timeout=120)
-        shutil.rmtree(hit.run)
-        hit.victim, hit.struck = "folder", True
-        hit.wait(hit.start())
+        shutil.rmtree(trial.run)
+        trial.victim, trial.injected = "folder", True
+        trial.wait(trial.start())
     else:
-        hit.wait(process)
+        trial.wait(process)
 
 
 def is_root(method: str) -> bool:
