@@ -149,7 +149,7 @@ def _describe_run(pieces: Pieces, run: WantedRun, job: Job) -> dict[str, Any]:
         "commit": last.get("commit"),
         "changed": last.get("changed"),
         "versions": {name: last.get(name) for name in ("popgen", "python", "torch", "numpy")},
-        "machine": piece.get("machine"),
+        "machine": piece.get("machine") or last.get("machine"),
         "taken_over": job.taken_over,
         "seconds": describe_seconds(record),
         "figures": {name: pieces.read_measured(job, name) for name in run.measures},

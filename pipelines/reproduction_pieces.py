@@ -108,7 +108,7 @@ class Pieces:
         return job
 
     def _make_job(self, run: WantedRun) -> Job:
-        words = (*run.words, f"seed={run.seed}", *self.plan.settings)
+        words = keep_last((*run.words, f"seed={run.seed}", *self.plan.settings))
         config = named(self.plan.compose(words), self.plan.out / "runs")
         planned = planned_run(config)
         for one in self._elsewhere:
@@ -196,6 +196,11 @@ class Pieces:
     def list_failures(self) -> list[str]:
         """Why pieces are not there, after an attempt."""
         return [f"{job.wanted.row}, seed {job.wanted.seed}: {job.failed}" for job in self.jobs.values() if job.failed]
+
+
+def keep_last(words: Sequence[str]) -> tuple[str, ...]:
+    """Overrides of which only the last of each setting counts, in order of their first."""
+    return tuple({word.partition("=")[0]: word for word in words}.values())
 
 
 def _find_runs(folders: Sequence[Path]) -> list[Path]:

@@ -1,7 +1,8 @@
 """Where a run's numbers come from: the code that each of its attempts ran, and the command that repeats it.
 
 runs/RUN_ID/
-  provenance.jsonl   one line an attempt: began (ISO time), popgen, python, torch, numpy, commit, changed
+  provenance.jsonl   one line an attempt: began (ISO time), popgen, python, torch, numpy, commit, changed,
+                     machine
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from popgen.errors import UserError
 from popgen.jsonable import jsonable
 from popgen.methods.registry import recipe
 from popgen.population.manifest import Versions
+from popgen.runs.machine import describe_machine
 
 PROVENANCE = "provenance.jsonl"
 _PLACES = ("run", "cluster", "tracking")
@@ -55,7 +57,8 @@ def _ask_git(root: Path, *words: str) -> str:
 def note_attempt(folder: Path) -> None:
     """Add a line for the attempt that begins."""
     began = datetime.now(UTC).isoformat(timespec="seconds")
-    line = {"began": began, **Versions.current().model_dump(), **read_commit()}
+    origin = {**Versions.current().model_dump(), **read_commit(), "machine": describe_machine()}
+    line = {"began": began, **origin}
     with (folder / PROVENANCE).open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 

@@ -83,7 +83,9 @@ def test_a_target_from_runs_to_table(run: Run, training: Training, tmp_path: Pat
     record = json.loads((folder / "record.json").read_text())
     first = record["runs"][0]
     assert first["figures"]["costs"]["by_members"] == [100, 310] and first["figures"]["costs"]["minutes"] == 2.0
-    assert first["command"].startswith("popgen run method=xpm_wm env=overcooked/cramped_room scale=smoke")
+    assert first["command"].startswith(
+        "popgen run method=xpm_wm env=overcooked/cramped_room scale=smoke population.size=2"
+    )
     assert first["machine"] and not first["taken_over"] and record["missing"] == []
     assert "| XPM-WM " in (folder / "report.md").read_text()
 

@@ -131,7 +131,7 @@ def test_a_page_of_records_is_the_same_twice(tmp_path: Path) -> None:
         (tmp_path / f"{name}.json").write_text(to_record_text(record(name, [sabotage(3, 0.1, -1.0)])))
     first, again = to_page(read_records(tmp_path)), to_page(read_records(tmp_path))
     assert first == again and first.index("Self-sabotage") < first.index("## Self-play and cross-play")
-    assert "1 of 1 runs were made before this command was there" in first
+    assert "1 of 1 runs were not made by this command but taken" in first
     (tmp_path / "other.json").write_text(json.dumps({"format": "popgen-crossplay"}))
     with pytest.raises(UserError, match="no record of popgen reproduce"):
         read_records(tmp_path)

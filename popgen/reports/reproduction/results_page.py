@@ -101,8 +101,8 @@ def _list_origins(record: Record) -> list[str]:
     told.append("Runs: " + "; ".join(f"{count} on {name}" for name, count in machines.items()) + ".")
     if before := sum(run["taken_over"] for run in runs):
         told.append(
-            f"{before} of {len(runs)} runs were made before this command was there and taken over: their settings, "
-            "seeds and files are these runs', the commit is not in their records where it says unknown."
+            f"{before} of {len(runs)} runs were not made by this command but taken over: method, environment, seed, "
+            "size and all settings that decide the result are the same."
         )
     if any(run["changed"] for run in runs):
         told.append("A commit with + had changes that were not committed.")
