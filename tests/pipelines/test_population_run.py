@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,11 +24,11 @@ from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.methods.training import Collected, Round, TrainedMember
 from popgen.methods.transport import InlineTransport, Ready
-from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress
+from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.replay import KIND_CODE
 from popgen.methods.xpm_wm.train import FirstMember, LaterMember
-from popgen.methods.xpm_wm.workers import ModelTask, Setup
+from popgen.methods.xpm_wm.workers import AgentUpdate, ModelTask, ModelUpdate, Setup
 from popgen.pipelines import population as main_job
 from popgen.pipelines.population import run_population
 from popgen.play.partner_strength import PartnerStrength
@@ -86,9 +87,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
-    """`scale=smoke`, two members, two rounds of the second, short episodes, all that goes by real play's counts."""
+    """`scale=smoke`, two members, two rounds of the second, short episodes, all that goes by real play's counts, both
+    learners side by side in both phases."""
     base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
     base += ["phase2.rounds=2", f"run.root={root}", f"run.id={name}", "agent.advantage_clip=5", "phase1.plateau=2"]
+    base += ["phase2.model_lag=1"]
     base += [f"discovery.{option}" for option in ("count_bonus=1", "trust=2", "rare_events=9", "found_events=1")]
     return RunConfig.parse(compose([*base, *overrides]))
 
@@ -396,6 +399,34 @@ def test_every_partner_is_met_in_both_seats(root: Path) -> None:
     later = later_member(root, 4, "phase2.episodes_xp=2", "phase2.rounds=9", "phase2.max_steps=640")
     assert set(later.pairs) == {(4, 1), (1, 4), (4, 2), (2, 4), (4, 3), (3, 4)}
     assert later.episodes_xp == 6 and later.most_rounds == 640 // ((2 + 6) * HORIZON)
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_the_agent_imagines_before_or_beside_the_world_models_update(root: Path, lag: int) -> None:
+    """In a later round; start states are from the newest real episodes in both cases."""
+    later = later_member(root, 2, f"phase2.model_lag={lag}", "phase2.updates_per_round=2")
+    later.progress.rounds = 1
+    asked: list[str] = []
+
+    def answer(name: str, result: Any) -> Callable[..., Ready[Any]]:
+        return lambda *_: (asked.append(name), Ready(result))[1]
+
+    names = {name: answer(name, None) for name in ("cache_starts", "model_weights")}
+    model = ModelUpdate(Ready({}), None, {"loss": 1.0})
+    learned = AgentUpdate(MemberWeights(Ready({}), Ready({}), Ready({})), {"entropy": 0.5})
+    later.work = SimpleNamespace(
+        **names,
+        update_world_model=answer("update_world_model", model),
+        update_agent=answer("update_agent", learned),
+        tally=lambda member: Ready(None),
+    )
+    loop, figures = later.train(), []
+    while len(asked) < 4 or len(figures) < 2:
+        record = next(loop)
+        figures += [name for name in getattr(record, "figures", {}) if name in ("model/loss", "agent/entropy")]
+    states, update, imagine = ["cache_starts", "model_weights"], ["update_world_model"], ["update_agent"]
+    assert asked == ([*states, *update, *imagine] if lag else [*update, *states, *imagine])
+    assert figures == (["agent/entropy", "model/loss"] if lag else ["model/loss", "agent/entropy"])
 
 
 @pytest.mark.parametrize(

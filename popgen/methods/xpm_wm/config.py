@@ -286,6 +286,9 @@ class Phase2Config(Schema):
     """Updates of actor and critics before each further round of real episodes."""
     model_updates: NonNegative = 300
     """World-model updates in each round after the first."""
+    model_lag: Annotated[int, Field(ge=0, le=1)] = 0
+    """1: the world model learns beside the agent, which imagines with that of the round before; 0: before the agent
+    does. Where imagination starts from is up to date in both."""
     model_lr: Rate = 1e-3
     """Adam's step size of the world model in phase 2."""
     episodes_sp: Batch = 8

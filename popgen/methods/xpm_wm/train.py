@@ -13,13 +13,16 @@ from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sam
 from popgen.methods.xpm_wm import phase_rules as rules
 from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
+from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.overlap import Overlap
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, ModelTask, ModelUpdate, Setup
+from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER
 
 Loop = Generator[Record, bool | None, Candidate]
+Learning = Generator[Record, bool | None, MemberWeights]
 Records = Generator[Record, bool | None, None]
 Result = Sampled | ModelUpdate | AgentUpdate
 FIRST = 1
@@ -201,22 +204,27 @@ class LaterMember:
         total, done = (rules.count_imagination(phase, rounds) for rounds in (self.most_rounds, progress.rounds))
         yield Phase(rules.IMAGINATION, total, self.member, done=done)
         while rules.plays_on(progress, phase, self.most_rounds):  # 4
-            if progress.rounds:
-                update = self.work.update_world_model(ModelTask(phase.model_updates)).result()  # 5-7
-                yield Progress(self.member, progress.steps, named_figures("model", update.metrics))
-            published = yield from self.learn_in_imagination()  # 8-16
+            update = None if phase.model_lag else self.update_world_model()  # 5-7
+            starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
+            update = self.update_world_model() if phase.model_lag else update  # 5-7, beside 8-16
+            published = yield from self.learn_in_imagination(model, starts)  # 8-16
+            if update is not None:
+                yield Progress(self.member, progress.steps, named_figures("model", update.result().metrics))
             sampled = self.collect_real_episodes(published)  # 17, 19, 20
             self.work.add_to_buffers(sampled, self.member)  # 18, 21
             yield self.judge(published, sampled)
         assert progress.best is not None
         return progress.best
 
-    def learn_in_imagination(self) -> Generator[Record, bool | None, MemberWeights]:
+    def update_world_model(self) -> Pending[ModelUpdate] | None:
+        """Lines 5 to 7; there is nothing new before the first real episodes."""
+        return self.work.update_world_model(ModelTask(self.phase.model_updates)) if self.progress.rounds else None
+
+    def learn_in_imagination(self, model: Pending[Weights], starts: Pending[Starts]) -> Learning:
         """Lines 8 to 15, in pieces for the progress bar: simulated self-play and cross-play with the strongest partner
         so far (9), objective (11-13), updates (14, 15)."""
         progress, plan = self.progress, rules.plan_imagination(self.progress.rounds, self.phase)
         scores = progress.strength.scores()  # 9
-        starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
         tally, done, best = self.tally(), plan.done, progress.best_shown
         while True:
             count = min(AGENT_PIECE, plan.done + plan.updates - done)
