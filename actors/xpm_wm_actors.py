@@ -231,6 +231,7 @@ class AgentActor:
         self.learner.set_model(model)
         self.learner.set_starts(task.starts.result(), task.new_share)
         self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
+        self.learner.constraint.multipliers = dict(task.multipliers)
         rates: dict[str, float] = {}
         if task.tally is not None:
             recent = None if task.recent is None else task.recent.result()

@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from popgen.config.cross_play_options import CrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
     Fraction,
     Layers,
     NonNegative,
-    Number,
     Positive,
     Rate,
     Schema,
@@ -94,7 +94,7 @@ class PpoConfig(Schema):
         return self
 
 
-class DiversityConfig(Schema):
+class DiversityConfig(CrossPlayOptions):
     """Cross-play and mixed play of LIPO and CoMeDi (paper, equations LIPO and CoMeDi)."""
 
     order: Literal["concurrent", "sequential"] = "concurrent"
@@ -109,13 +109,6 @@ class DiversityConfig(Schema):
     """Cross-play environments with each partner, half of them in each seating."""
     mp_envs: Annotated[_Int, Field(ge=2, le=100_000, multiple_of=2)] = 32
     """Mixed-play environments with each partner, half of them in each seating."""
-    xp_clip: Weight = 0.0
-    """Bound of cross-play advantages, in units of self-play's spread; 0: none. Ours, as in XPM-Sim."""
-    xp_limit: Number | None = None
-    """A score: cross-play with a partner is pressed down until it is there, by a multiplier of lambda_XP; null: always.
-    """
-    multiplier_step: Fraction = 0.5
-    """Step of that multiplier, in [0, 1], each time that scores with the partner arrive."""
     xp_loss: Literal["signed", "negated"] = "signed"
     """`signed` negates the advantage before the clipped surrogate; `negated` the surrogate after it."""
     partner_random: Fraction = 0.15

@@ -6,16 +6,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from popgen.config.cross_play_options import CrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
     Fraction,
     Layers,
     NonNegative,
-    Number,
     Positive,
     Rate,
-    Schema,
     Weight,
     Width,
     _Float,
@@ -27,7 +26,7 @@ _Steps = Annotated[_Int, Field(ge=1, le=100_000)]  # of one simulated trajectory
 _Some = Annotated[_Int, Field(ge=0, le=100_000)]  # of what may be left out
 
 
-class XpmSimConfig(Schema):
+class XpmSimConfig(CrossPlayOptions):
     """Buffers, simulated trajectories and the objective (paper, section 3 and the table of MPPMR agents).
 
     The means over three groups of trajectories enter the objective: self-play from B_SP (`sims_sp`) and from B_XP
@@ -99,13 +98,6 @@ class XpmSimConfig(Schema):
     """Updates over which lambda_XP rises in a straight line; 0: full weight at once."""
     lambda_until: Fraction = 1.0
     """Share of `updates` after which lambda_XP is 0; 1: never."""
-    xp_clip: Weight = 0.0
-    """Bound of cross-play advantages, in units of self-play's spread; 0: none."""
-    xp_limit: Number | None = None
-    """A score: cross-play with a partner is pressed down until it is there, by a multiplier of lambda_XP; null: always.
-    """
-    multiplier_step: Fraction = 0.5
-    """Step of that multiplier, in [0, 1], each time that real scores with the partner arrive."""
     sp_weight: Weight = 1.0
     """Weight of self-play from start states and B_SP in the objective."""
     restart_weight: Weight = 1.0

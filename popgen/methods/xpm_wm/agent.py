@@ -45,7 +45,7 @@ from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
-from popgen.play.partner_strength import any_or_strongest
+from popgen.play.partner_strength import PartnerConstraint, any_or_strongest
 
 
 def cross_play_weight(config: AgentConfig, updates: int) -> float:
@@ -112,6 +112,7 @@ class AgentLearner:
         self.new_share = 0.0
         self.partner_scores: dict[int, float] = {}
         self.imagined_scores: dict[int, float] = {}
+        self.constraint = PartnerConstraint(config.xp_limit, config.multiplier_step)
         self.plays = False
         self.networks = self._fresh_networks(seed)
         self.updates = self.playing = self.finding = 0
@@ -151,13 +152,16 @@ class AgentLearner:
         self.starts, self.new_share = starts, new_share
 
     def choose_partner(self) -> int | None:
-        """The strongest cross-play partner, at times a random one; None in pure self-play.
+        """The strongest cross-play partner, at times a random one; under a constraint one that is drawn in proportion
+        to the multipliers; None in pure self-play.
 
         Scores are real returns of each partner's latest window in B_XP; a partner without any comes first, the
         one with the highest imagined return leading.
         """
         if not self.partners or self.config.lambda_xp == 0.0:
             return None
+        if self.config.xp_limit is not None:
+            return self.constraint.draw_partner(sorted(self.partners), self.rng)
         share = self.config.partner_random
         return any_or_strongest(self.partners, self.partner_scores, share, self.rng, self.imagined_scores)
 
@@ -246,7 +250,7 @@ class AgentLearner:
 
     def cross_play(self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor) -> PolicyTarget:
         """-lambda_XP J_XP, in self-play's unit; what is earned with the partner is remembered."""
-        weight = self.lambda_now()
+        weight = self.lambda_now() * self.constraint.pressure(list(self.partners))
         target = cross_play_target(
             self.networks, imagined, partner, seats, unit=unit, weight=weight, entropy_scale=self.entropy_now() * weight
         )

@@ -12,7 +12,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from popgen.losses.policy_losses import ReturnScale, clipped_loss, lambda_return, reinforce, signed_advantage
+from popgen.losses.policy_losses import (
+    ReturnScale,
+    bound_advantage,
+    clipped_loss,
+    lambda_return,
+    reinforce,
+    signed_advantage,
+)
 from popgen.methods.xpm_wm.actor_critic import Actor, Critic
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.imagination import Imagined
@@ -282,11 +289,12 @@ def cross_play_target(
     weight: float,
     entropy_scale: float,
 ) -> PolicyTarget:
-    """-lambda_XP J_XP with `partner`, in self-play's `unit`; `weight` is lambda_XP."""
+    """-lambda_XP J_XP with `partner`, in self-play's `unit`, at most `agent.xp_clip` of them; `weight` is lambda_XP."""
     steps, batch = imagined.reward.shape
     returns, value = networks.targets(imagined, partner, seats.expand(steps + 1, batch))
     advantage = returns - value[:-1]
-    signed = signed_advantage(Kind.XP, advantage, weight=weight, scale=unit)
+    bounded = bound_advantage(advantage, clip=networks.config.xp_clip, spread=unit)
+    signed = signed_advantage(Kind.XP, bounded, weight=weight, scale=unit)
     figures = {
         "imagined_shaped_xp": float(imagined.reward.mean()),
         "imagined_return_xp": float(returns.mean()),

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, model_validator
 
+from popgen.config.cross_play_options import CrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
@@ -113,7 +114,7 @@ class WorldModelConfig(Schema):
         return self
 
 
-class AgentConfig(Schema):
+class AgentConfig(CrossPlayOptions):
     """Actor, centralised critics and the XPM-Sim objective (paper, equation XPM-Sim)."""
 
     units: Width = 128
@@ -286,7 +287,7 @@ class Phase2Config(Schema):
     """Updates of actor and critics before each further round of real episodes."""
     model_updates: NonNegative = 300
     """World-model updates in each round after the first."""
-    model_lag: Annotated[int, Field(ge=0, le=1)] = 0
+    model_lag: Annotated[_Int, Field(ge=0, le=1)] = 0
     """1: the world model learns beside the agent, which imagines with that of the round before; 0: before the agent
     does. Where imagination starts from is up to date in both."""
     model_lr: Rate = 1e-3

@@ -12,7 +12,7 @@ from popgen.methods.xpm_wm.config import WatchConfig
 from popgen.methods.xpm_wm.imagination import Starts
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
-from popgen.play.partner_strength import PartnerStrength
+from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 
 LEAST_PAY = 0.05
 """Imagined reward a step below which nothing is farmed: a pick-up every twenty steps."""
@@ -125,10 +125,10 @@ class Candidate:
     sp: float
     xp: float
 
-    @property
-    def merit(self) -> float:
-        """Self-play less the strongest cross-play: what a member is chosen by."""
-        return self.sp - self.xp
+    def merit(self, xp_limit: float | None = None) -> float:
+        """Self-play less the strongest cross-play: what a member is chosen by. Cross-play below its limit is worth no
+        more than at it."""
+        return self.sp - (self.xp if xp_limit is None else max(self.xp, xp_limit))
 
     def to_state(self) -> State:
         """For a checkpoint."""
@@ -256,6 +256,7 @@ class LaterMemberProgress:
 
     Attributes:
         strength: each partner's returns in real cross-play.
+        constraint: the multipliers that its scores there have led to.
         steps: environment steps so far.
         rounds: of real episodes that have ended; since_best: since the best of them.
         plays: self-play has begun (`agent.entropy_after` of the target).
@@ -272,6 +273,7 @@ class LaterMemberProgress:
     figures: dict[str, float] = field(default_factory=dict)
     since_best: int = 0
     watch: Watch = field(default_factory=Watch)
+    constraint: PartnerConstraint = field(default_factory=lambda: PartnerConstraint(None, 0.0))
 
     @property
     def best_shown(self) -> dict[str, float]:
@@ -288,13 +290,13 @@ class LaterMemberProgress:
             "watch": self.watch.to_state(),
             "best": self.best.to_state(),
             "strength": self.strength.state(),
+            "constraint": self.constraint.state(),
         }
 
-    @staticmethod
-    def from_state(state: State, strength: PartnerStrength, steps: int, put: Put) -> LaterMemberProgress:
-        """From `to_state()`, as it was read."""
-        strength.load_state(state["strength"])
-        best = Candidate.from_state(state["best"], put)
-        rounds, plays, since_best = int(state["rounds"]), bool(state["plays"]), int(state["since_best"])
-        watch = Watch.from_state(state["watch"])
-        return LaterMemberProgress(strength, steps, rounds, plays, best, since_best=since_best, watch=watch)
+    def load_state(self, state: State, put: Put) -> None:
+        """Go on from `to_state()`, as it was read; the steps are known."""
+        self.strength.load_state(state["strength"])
+        self.constraint.load_state(state["constraint"])
+        self.best = Candidate.from_state(state["best"], put)
+        self.rounds, self.plays = int(state["rounds"]), bool(state["plays"])
+        self.since_best, self.watch = int(state["since_best"]), Watch.from_state(state["watch"])

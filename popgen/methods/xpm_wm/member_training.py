@@ -14,7 +14,7 @@ from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
-from popgen.play.partner_strength import PartnerStrength
+from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 
 ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS = 8e-5, 5e-5, 5e-6
 """On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step."""
@@ -60,7 +60,9 @@ class XpmWmTraining:
         if self.member == FIRST:
             # An episode of each environment: fewer reach the target by luck, where some end in a stand-still.
             return FirstMemberProgress(max(16, self.config.phase1.envs), steps)
-        return LaterMemberProgress(PartnerStrength(self.config.agent.partner), steps)
+        agent = self.config.agent
+        constraint = PartnerConstraint(agent.xp_limit, agent.multiplier_step)
+        return LaterMemberProgress(PartnerStrength(agent.partner), steps, constraint=constraint)
 
     def adopt(self, weights: dict[int, Weights], left: State) -> None:
         """Take over finished members, their buffers and the world model."""
@@ -160,8 +162,9 @@ class XpmWmTraining:
             self.work.restore_samplers(checkpoint.state["samplers"])
         else:
             same_form(state["best"]["published"], form, "the published policy")
-            strength = PartnerStrength(self.config.agent.partner)
-            self.progress = LaterMemberProgress.from_state(state, strength, steps, self.work.put)
+            self.progress = progress = self._fresh_progress(steps)
+            assert isinstance(progress, LaterMemberProgress)
+            progress.load_state(state, self.work.put)
         self.resumed = True
 
     def close(self) -> None:

@@ -194,16 +194,20 @@ def plays_on(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> b
 def judge_round(
     progress: LaterMemberProgress, published: MemberWeights, episodes: Sequence[Episode], horizon: int
 ) -> Candidate:
-    """Line 9's returns from B_XP, of every partner met; the round's policy with its scores, kept if it is the best."""
+    """Line 9's returns from B_XP, of every partner met, and what follows for its multiplier; the round's policy with
+    its scores, kept if it is the best."""
     own = [e for e in episodes if e.kind is Kind.SP]
     partners = sorted({partner for e in episodes if e.kind is Kind.XP for partner in e.members} - set(own[0].members))
     cross = {k: [e for e in episodes if e.kind is Kind.XP and k in e.members] for k in partners}
     for partner, met in cross.items():
         progress.strength.add(partner, [e.shaped for e in met])
-    strongest = max(float(np.mean([e.score for e in met])) for met in cross.values())
+    scores = {k: float(np.mean([e.score for e in met])) for k, met in cross.items()}
+    strongest = max(scores.values())
     candidate = Candidate(published, float(np.mean([e.score for e in own])), strongest)
+    limit = progress.constraint.limit
+    progress.constraint.add(scores, candidate.sp)
     progress.since_best += 1
-    if progress.best is None or candidate.merit > progress.best.merit:
+    if progress.best is None or candidate.merit(limit) > progress.best.merit(limit):
         progress.best, progress.since_best = candidate, 0
     progress.rounds += 1
     progress.figures = {

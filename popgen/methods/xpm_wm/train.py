@@ -229,6 +229,7 @@ class LaterMember:
         while True:
             count = min(AGENT_PIECE, plan.done + plan.updates - done)
             task = AgentTask(count, model, starts, plan.new_share, scores, progress.plays, tally)
+            task = replace(task, multipliers=progress.constraint.multipliers)
             update = self.work.update_agent(task).result()  # 11-15
             self.imagined = named_figures("agent", update.metrics) | {"updates": done}
             shown = {"steps": progress.steps, "entropy": round(update.metrics["entropy"], 2), **best}

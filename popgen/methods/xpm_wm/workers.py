@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from popgen.envs.contract import EnvSpec
@@ -59,6 +59,7 @@ class AgentTask:
         plays: real self-play has begun.
         tally: of real play, where anything goes by it.
         recent: states of this member's latest self-play; None: those among `starts`.
+        multipliers: of each partner's cross-play, where that is a constraint; 1 for those that are not there.
     """
 
     updates: int
@@ -69,6 +70,7 @@ class AgentTask:
     plays: bool
     tally: Tally | None = None
     recent: Pending[Starts] | None = None
+    multipliers: Mapping[int, float] = field(default_factory=dict[int, float])
 
 
 @dataclass(frozen=True)

@@ -317,6 +317,27 @@ def test_now_and_then_any_partner_is_chosen() -> None:
         assert (chosen == partner).mean() == pytest.approx(share, abs=4 * (share * (1 - share) / 3000) ** 0.5)
 
 
+def test_under_a_constraint_partners_are_drawn_by_their_multipliers_which_weigh_lambda() -> None:
+    learner = make_learner(partners=(1, 2, 4), xp_limit=0.5, **REINFORCE)
+    learner.constraint.multipliers = {1: 0.0, 2: 0.5, 4: 0.25}
+    chosen = np.array([learner.choose_partner() for _ in range(3000)])
+    assert set(chosen) == {2, 4}
+    assert (chosen == 2).mean() == pytest.approx(2 / 3, abs=0.035)
+    target = learner.cross_play(trajectories(ROWS, lambda a: good_and_bad(a[..., 0]), seed=1), 2, SEATS, torch.ones(()))
+    assert target.figures["lambda"] == pytest.approx(0.5 * learner.lambda_now())
+    learner.constraint.multipliers = {}  # nobody was met: the whole pressure
+    assert learner.constraint.pressure([1, 2, 4]) == 1.0
+
+
+def test_cross_play_advantages_are_bounded_in_units_of_self_play() -> None:
+    imagined = trajectories(ROWS, lambda a: good_and_bad(a[..., 0]), seed=1)
+    free, bounded = make_learner(**REINFORCE), make_learner(xp_clip=0.1, **REINFORCE)
+    unit, weight = torch.tensor(2.0), bounded.lambda_now()
+    raw = free.cross_play(imagined, 1, SEATS, unit).samples.advantage
+    cut = bounded.cross_play(imagined, 1, SEATS, unit).samples.advantage
+    assert raw.abs().max() > 0.2 * weight >= float(cut.abs().max()) - 1e-6
+
+
 @pytest.mark.parametrize(("reading", "wanted"), [("partner", {2}), ("any", {1, 2})])
 def test_cross_play_starts_from_states_with_that_partner(
     monkeypatch: pytest.MonkeyPatch, reading: str, wanted: set[int]

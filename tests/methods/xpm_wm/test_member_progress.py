@@ -15,7 +15,7 @@ from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.play.episodes import Episode
-from popgen.play.partner_strength import PartnerStrength
+from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 from popgen.types import Kind
 
 AFTER = 0.5
@@ -187,7 +187,25 @@ def test_rare_events_are_those_seen_too_seldom() -> None:
 
 
 def test_a_member_is_chosen_by_self_play_less_strongest_cross_play() -> None:
-    assert Candidate(LATEST, 5.0, 3.5).merit == 1.5
+    assert Candidate(LATEST, 5.0, 3.5).merit() == 1.5
+
+
+def test_cross_play_below_its_limit_is_worth_no_more_than_at_it() -> None:
+    assert [Candidate(LATEST, 5.0, xp).merit(xp_limit=1.0) for xp in (0.0, 1.0, 3.0)] == [4.0, 4.0, 2.0]
+
+
+def test_a_round_moves_the_multipliers_of_the_partners_it_met() -> None:
+    """m + step (XP - limit) / (SP - limit): partner 1 at half of self-play's excess, 2 below the limit."""
+    progress = LaterMemberProgress(PartnerStrength("max_window"), constraint=PartnerConstraint(1.0, 0.5))
+    progress.constraint.multipliers = {1: 0.5, 2: 0.5}
+    episodes = [
+        Episode(Kind.SP, (3, 3), 9.0, 9.0),
+        Episode(Kind.XP, (3, 1), 5.0, 5.0),
+        Episode(Kind.XP, (2, 3), 0.0, 0.0),
+    ]
+    scored = rules.judge_round(progress, LATEST, episodes, 400)
+    assert (scored.sp, scored.xp) == (9.0, 5.0)
+    assert progress.constraint.multipliers == {1: 0.75, 2: 0.5 - 0.5 / 8.0}
 
 
 def saved(progress: FirstMemberProgress | LaterMemberProgress) -> dict[str, Any]:
@@ -218,7 +236,9 @@ def test_progress_of_a_later_member_comes_back_from_a_checkpoint() -> None:
     best = Candidate(LATEST, 4.0, 1.0)
     later = LaterMemberProgress(PartnerStrength("max_window"), rounds=3, plays=True, best=best, since_best=2)
     later.strength.add(1, [2.0, 4.0])
-    strength = PartnerStrength("max_window")
-    again = LaterMemberProgress.from_state(saved(later), strength, 160, InlineTransport().put)
+    later.constraint.multipliers = {1: 0.25}
+    again = LaterMemberProgress(PartnerStrength("max_window"), 160)
+    again.load_state(saved(later), InlineTransport().put)
+    assert again.constraint.multipliers == {1: 0.25}
     assert (again.rounds, again.plays, again.steps, again.since_best) == (3, True, 160, 2)
-    assert again.strength.scores() == {1: 3.0} and again.best is not None and again.best.merit == 3.0
+    assert again.strength.scores() == {1: 3.0} and again.best is not None and again.best.merit() == 3.0

@@ -1,0 +1,17 @@
+"""Options of cross-play that every objective with lambda_XP has."""
+
+from __future__ import annotations
+
+from popgen.config.schema import Fraction, Number, Schema, Weight
+
+
+class CrossPlayOptions(Schema):
+    """A bound of its advantages, and a constraint in the place of a weight (`popgen.losses.policy_losses`); ours."""
+
+    xp_clip: Weight = 0.0
+    """Bound of cross-play advantages, in units of self-play's spread; 0: none."""
+    xp_limit: Number | None = None
+    """A score: cross-play with a partner is pressed down until it is there, by a multiplier of lambda_XP; null: always.
+    """
+    multiplier_step: Fraction = 0.5
+    """Step of that multiplier, in [0, 1], each time that real scores with the partner arrive."""
