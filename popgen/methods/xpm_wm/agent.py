@@ -152,12 +152,8 @@ class AgentLearner:
         self.starts, self.new_share = starts, new_share
 
     def choose_partner(self) -> int | None:
-        """The strongest cross-play partner, at times a random one; under a constraint one that is drawn in proportion
-        to the multipliers; None in pure self-play.
-
-        Scores are real returns of each partner's latest window in B_XP; a partner without any comes first, the
-        one with the highest imagined return leading.
-        """
+        """The strongest by real returns, at times a random one, those without any first, by imagined returns; under a
+        constraint one drawn in proportion to the multipliers; None in pure self-play."""
         if not self.partners or self.config.lambda_xp == 0.0:
             return None
         if self.config.xp_limit is not None:

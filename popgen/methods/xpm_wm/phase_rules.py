@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from popgen.methods.training import Progress, Round, Sampled
+from popgen.methods.training import Phase, Progress, Round, Sampled
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.member_progress import (
     Candidate,
@@ -131,6 +131,17 @@ def describe_random_play(progress: FirstMemberProgress, sampled: tuple[Sampled, 
     return Progress(member, steps, sampled=sampled, done=steps, shown={"steps": steps})
 
 
+def describe_pretraining(progress: FirstMemberProgress, figures: dict[str, float], done: int) -> Progress:
+    """So many of the world model's first updates are done."""
+    shown = {"model_loss": round(figures["model/loss_observation"], 2)}
+    return Progress(1, progress.steps, figures, done=done, shown=shown)
+
+
+def describe_self_play(progress: FirstMemberProgress, phase: Phase1Config) -> Phase:
+    """The phase of member 1 after random play: what was played of it so far is done."""
+    return Phase(SELF_PLAY, self_play_steps(phase), 1, done=count_self_play(progress, phase))
+
+
 def describe_first_round(progress: FirstMemberProgress, phase: Phase1Config, score_name: str) -> Round:
     """The round that has ended, with the figures so far."""
     figures, steps, member = dict(progress.figures), progress.steps, 1
@@ -223,6 +234,18 @@ def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name:
     """A round in a line."""
     scores = f"SP {scored.sp:.2f}, strongest XP {scored.xp:.2f} {score_name}"
     return f"round {progress.rounds}: {scores}, {progress.steps:,} steps"
+
+
+def describe_imagination(progress: LaterMemberProgress, phase: Phase2Config, member: int, most: int) -> Phase:
+    """The phase of a later member: updates of at most so many rounds, those of the rounds so far done."""
+    total, done = (count_imagination(phase, rounds) for rounds in (most, progress.rounds))
+    return Phase(IMAGINATION, total, member, done=done)
+
+
+def describe_updates(progress: LaterMemberProgress, member: int, figures: dict[str, float], done: int) -> Progress:
+    """So many of the member's updates in imagination are done."""
+    shown = {"steps": progress.steps, "entropy": round(figures["agent/entropy"], 2), **progress.best_shown}
+    return Progress(member, progress.steps, figures, done=done, shown=shown)
 
 
 def describe_later_round(

@@ -43,8 +43,7 @@ class FirstMember:
         if not resumed:
             yield from self.collect_random_episodes()
             yield from self.pretrain()
-        done = rules.count_self_play(self.progress, self.phase)
-        yield Phase(rules.SELF_PLAY, rules.self_play_steps(self.phase), FIRST, done=done)
+        yield rules.describe_self_play(self.progress, self.phase)
         if not resumed:
             self.start_self_play()
             yield Round(FIRST, self.progress.steps, number=0, must_save=True)
@@ -74,9 +73,7 @@ class FirstMember:
             count = min(MODEL_PIECE, total - done)
             update = self.update_world_model(count).result()
             self.progress.model, self.progress.starts = update.weights, update.starts
-            figures = named_figures("model", update.metrics)
-            shown = {"model_loss": round(update.metrics["loss_observation"], 2)}
-            yield Progress(FIRST, self.progress.steps, figures, done=done + count, shown=shown)
+            yield rules.describe_pretraining(self.progress, named_figures("model", update.metrics), done + count)
         self.progress.published = self.update_agent().result().weights
 
     def start_self_play(self, stagger: bool = True) -> None:
@@ -201,8 +198,7 @@ class LaterMember:
     def train(self) -> Loop:
         """All rounds; line 1 is done."""
         phase, progress = self.phase, self.progress
-        total, done = (rules.count_imagination(phase, rounds) for rounds in (self.most_rounds, progress.rounds))
-        yield Phase(rules.IMAGINATION, total, self.member, done=done)
+        yield rules.describe_imagination(progress, phase, self.member, self.most_rounds)
         while rules.plays_on(progress, phase, self.most_rounds):  # 4
             update = None if phase.model_lag else self.update_world_model()  # 5-7
             starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
@@ -224,17 +220,13 @@ class LaterMember:
         """Lines 8 to 15, in pieces for the progress bar: simulated self-play and cross-play with the strongest partner
         so far (9), objective (11-13), updates (14, 15)."""
         progress, plan = self.progress, rules.plan_imagination(self.progress.rounds, self.phase)
-        scores = progress.strength.scores()  # 9
-        tally, done, best = self.tally(), plan.done, progress.best_shown
+        scores, pressed, done = progress.strength.scores(), progress.constraint.multipliers, plan.done  # 9
+        task = AgentTask(0, model, starts, plan.new_share, scores, progress.plays, self.tally(), multipliers=pressed)
         while True:
             count = min(AGENT_PIECE, plan.done + plan.updates - done)
-            task = AgentTask(count, model, starts, plan.new_share, scores, progress.plays, tally)
-            task = replace(task, multipliers=progress.constraint.multipliers)
-            update = self.work.update_agent(task).result()  # 11-15
-            self.imagined = named_figures("agent", update.metrics) | {"updates": done}
-            shown = {"steps": progress.steps, "entropy": round(update.metrics["entropy"], 2), **best}
-            done += count
-            yield Progress(self.member, progress.steps, self.imagined, done=done, shown=shown)
+            update = self.work.update_agent(replace(task, updates=count)).result()  # 11-15
+            self.imagined, done = named_figures("agent", update.metrics) | {"updates": done}, done + count
+            yield rules.describe_updates(progress, self.member, self.imagined, done)
             if done == plan.done + plan.updates:
                 return update.weights
 
@@ -255,5 +247,4 @@ class LaterMember:
         progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
         trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
         ended = rules.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)
-        at_rest = rules.plays_on(progress, self.phase, self.most_rounds)
-        return replace(ended, sampled=tuple(sampled), at_rest=at_rest)
+        return replace(ended, sampled=tuple(sampled), at_rest=rules.plays_on(progress, self.phase, self.most_rounds))
