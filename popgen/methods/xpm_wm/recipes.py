@@ -6,6 +6,7 @@ from popgen.methods.recipe import Recipe, because, ours
 
 _CHANCE = "chance alone must find the first soup (docs/notes/learning.md, Forced coordination)"
 _FALSE_DELIVERIES = "imagined deliveries must not outnumber real ones (docs/notes/learning.md, The counter circuit)"
+_DREAMER = "DreamerV3's (Hafner et al. 2025), which the paper builds on; its table has none"
 _NEVER = "never reached: the table's steps are what is run"
 
 LAPTOP = Recipe(
@@ -117,8 +118,9 @@ SMOKE = Recipe(
 PAPER = Recipe(
     "paper",
     'The table "Hyperparameters for XPM-WM on Overcooked AI Layout" to the letter, its objective and algorithm 1. '
-    "What is not set here keeps the schema's default and is ours as well; events count at dispensers and pots only "
-    "(ours, since pick-ups from counters can be farmed): the table's are env.params.events=raw.",
+    "Beside it DreamerV3's numbers where that has some; what is not set here keeps the schema's default and is ours; "
+    "events count at dispensers and pots only (ours, since pick-ups from counters can be farmed): the table's are "
+    "env.params.events=raw.",
     {
         "world_model.view": "lossless",
         "world_model.imagination": "sample",
@@ -138,6 +140,11 @@ PAPER = Recipe(
         "world_model.learning_rate": 2e-4,
         "world_model.event_scale": because(1.0, "the terms of the loss are summed"),
         "world_model.continue_scale": 1.0,
+        "world_model.kl_dyn": because(1.0, _DREAMER),
+        "world_model.kl_rep": because(0.1, _DREAMER),
+        "world_model.free_nats": because(1.0, _DREAMER),
+        "world_model.batch": ours(22, "windows of as many states as DreamerV3's 16 of 64"),
+        "world_model.length": ours(46, "DreamerV3's 64 do not fit into the update interval of 50 steps"),
         "world_model.kl_predecessors": ours(1.0, "the paper's gamma has no value in the table"),
         "world_model.predecessors": ours("partner", "of the partner that the window was played with"),
         "agent.units": 512,
@@ -145,6 +152,9 @@ PAPER = Recipe(
         "agent.activation": "leaky_relu",
         "agent.actor_input": ours("model", "h beside z^i, as the decoder's"),
         "agent.horizon": 15,
+        "agent.bins": because(255, _DREAMER),
+        "agent.discount": because(0.997, _DREAMER),
+        "agent.lam": because(0.95, _DREAMER),
         "agent.actor_lr": 4e-5,
         "agent.critic_lr": 1e-4,
         "agent.entropy": 0.03,

@@ -72,6 +72,17 @@ def test_latents_are_28_joint_groups_and_4_private_ones_of_32_classes(model: Wor
     assert model.prior(torch.zeros(1, 512)).shape == (1, 32, 32)
 
 
+def test_what_the_table_leaves_open_is_dreamers_and_not_the_laptops(config: RunConfig) -> None:
+    """KL balance 1 and 0.1 with one free nat, 255 bins, horizon 333; windows of 1,024 states but for the interval of
+    50 steps, into which a window and its four steps ahead must fit."""
+    model, agent, laptop = config.world_model, config.agent, RunConfig.parse(compose(["env=overcooked/cramped_room"]))
+    assert (model.kl_dyn, model.kl_rep, model.free_nats) == (1.0, 0.1, 1.0)
+    assert (agent.bins, agent.discount, agent.lam, agent.slow_critic) == (255, 0.997, 0.95, 0.98)
+    assert model.length + 4 == config.phase1.steps_per_iteration == 50
+    assert abs(model.length * model.batch - 16 * 64) <= model.length // 2
+    assert laptop.world_model.kl_rep != model.kl_rep and laptop.world_model.length != model.length
+
+
 def test_agent(config: RunConfig, model: WorldModel) -> None:
     agent = AgentLearner(config.agent, config.world_model, model.spec, member=1, seed=0)
     assert hidden(agent.actor.net) == hidden(agent.critics["0"].net) == [512] * 5
