@@ -19,8 +19,8 @@ demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 test: install  ## all tests
 	$(PYTEST)
 
-test-fast: install  ## the tests without Ray (the oracle plays 4,000 steps of each layout, not 20,000)
-	POPGEN_ORACLE_STEPS=4000 $(PYTEST) -m "not ray"
+test-fast: install  ## the tests without Ray (the oracle plays 2,000 steps of each layout, not 20,000)
+	POPGEN_ORACLE_STEPS=2000 $(PYTEST) -m "not ray"
 
 lint: install docs types  ## style, types and documentation
 	$(BIN)/ruff check .

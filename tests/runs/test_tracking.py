@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import sqlite3
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 from popgen.config.sections import TrackingConfig
 from popgen.errors import UserError
 from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.runs import mlflow_tracker
 from popgen.runs.mlflow_tracker import SCALING_METRIC, STORE, LocalTracker, Tracker, choose_store, view_address
 from popgen.runs.tracking_address import sqlite_uri
 
@@ -25,6 +28,30 @@ def client(tracker: Tracker) -> Any:
     from mlflow.tracking import MlflowClient
 
     return MlflowClient(tracking_uri=tracker.uri)
+
+
+@pytest.fixture(scope="module")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store's file with MLflow's tables, which take seconds to make."""
+    tracker = Tracker(TrackingConfig(), tmp_path_factory.mktemp("empty"), "first")
+    path = tracker.store / STORE
+    with sqlite3.connect(path) as store:
+        for table in ("params", "tags", "experiment_tags", "runs", "experiments"):
+            store.execute(f"delete from {table} where true" + (" and experiment_id != 0" * (table == "experiments")))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def ready_tables(empty_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """New stores of this process begin with the tables of `empty_store`."""
+    lock_store = mlflow_tracker._lock_store
+
+    def copy_tables(store: Path, uri: str | None) -> Any:
+        if uri is None and not (store / STORE).exists():
+            shutil.copy(empty_store, store / STORE)
+        return lock_store(store, uri)
+
+    monkeypatch.setattr(mlflow_tracker, "_lock_store", copy_tables)
 
 
 @pytest.fixture(scope="module")
