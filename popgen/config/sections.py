@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StrictBool, model_validator
 
-from popgen.config.schema import Batch, Fraction, Positive, Schema, Text, Weight, _Int
+from popgen.config.schema import Batch, Fraction, Positive, Rate, Schema, Text, Weight, _Int
 from popgen.errors import UserError
 
 Place = Annotated[str, AfterValidator(os.path.expanduser)]
@@ -126,3 +126,22 @@ class RunSection(Schema):
     """Bytes to leave free: with less room on the disk the run stops by itself, its checkpoints whole."""
     storage: str | None = None
     """Second place for all that resuming needs, such as s3://bucket/path (docs/reliability.md); null: none."""
+
+
+class PpoSection(Schema):
+    """What every learner by PPO's clipped surrogate has, egos and baselines alike."""
+
+    minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 4
+    """Parts into which each pass divides the samples, a gradient step each."""
+    clip: Rate = 0.2
+    """Largest change of the probability ratio that the surrogate rewards (PPO's epsilon)."""
+    discount: Fraction = 0.99
+    """Discount of rewards per step (gamma)."""
+    lam: Fraction = 0.95
+    """Lambda of the generalised advantage estimate: 0 trusts the critic, 1 the returns."""
+    learning_rate: Rate = 1e-3
+    """Adam's step size at the start, of actors and critics."""
+    entropy: Weight = 0.01
+    """Weight of the policy's entropy at the start (the paper's entropy coef.)."""
+    entropy_end: Fraction = 1.0
+    """Share of `entropy` that is left at the end of training; it falls in a straight line."""

@@ -13,19 +13,19 @@ from popgen.config.schema import (
     NonNegative,
     Number,
     Positive,
-    Rate,
     Schema,
     Text,
     Weight,
     Width,
     _Int,
 )
+from popgen.config.sections import PpoSection
 from popgen.errors import UserError
 
 _Steps = Annotated[_Int, Field(ge=1, le=100_000)]  # of one rollout, sequence or decision
 
 
-class EgoConfig(Schema):
+class EgoConfig(PpoSection):
     """Whom an ego is trained with, its network and PPO."""
 
     partners: tuple[Text, ...] = ()
@@ -59,22 +59,8 @@ class EgoConfig(Schema):
     """Steps through which gradients flow back; the memory before them is kept from the rollout."""
     epochs: Annotated[_Int, Field(ge=1, le=1000)] = 3
     """Passes over the data of an update."""
-    minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 4
-    """Gradient steps in each pass."""
-    clip: Rate = 0.2
-    """Clipping of the probability ratio."""
-    discount: Fraction = 0.99
-    """Of rewards, by step."""
-    lam: Fraction = 0.95
-    """Lambda of the generalised advantages."""
-    learning_rate: Rate = 1e-3
-    """Adam's, at the beginning."""
     learning_rate_end: Fraction = 0.1
-    """Share of it at the end, to which it falls evenly."""
-    entropy: Weight = 0.01
-    """Weight of the actions' entropy at the beginning."""
-    entropy_end: Fraction = 1.0
-    """Share of it at the end, to which it falls evenly."""
+    """Share of `learning_rate` that is left at the end of training; it falls in a straight line."""
     value_weight: Weight = 0.5
     """Weight of the critic's error, on the scale of normalised returns."""
     value_decay: Fraction = 0.95

@@ -20,12 +20,13 @@ from popgen.config.schema import (
     Width,
     _Int,
 )
+from popgen.config.sections import PpoSection
 from popgen.errors import UserError
 
 _Kernel = Annotated[_Int, Field(ge=1, le=31)]
 
 
-class PpoConfig(Schema):
+class PpoConfig(PpoSection):
     """MAPPO (Yu et al. 2022): decentralised actors, a centralised critic, the clipped surrogate.
 
     Actors and critics have the same sizes and weights of their own. A member's training ends with an iteration.
@@ -51,22 +52,8 @@ class PpoConfig(Schema):
     """Remote processes that share the environments; 0: the learner's process steps them."""
     epochs: Annotated[_Int, Field(ge=1, le=1000)] = 4
     """Passes over an iteration's samples."""
-    minibatches: Annotated[_Int, Field(ge=1, le=10_000)] = 4
-    """Parts into which each pass divides the samples, a gradient step each."""
-    clip: Rate = 0.2
-    """Largest change of the probability ratio that the surrogate rewards (PPO's epsilon)."""
-    discount: Fraction = 0.99
-    """Discount of rewards per step (gamma)."""
-    lam: Fraction = 0.95
-    """Lambda of the generalised advantage estimate: 0 trusts the critic, 1 the returns."""
-    learning_rate: Rate = 1e-3
-    """Adam's step size at the start, of actors and critics."""
     learning_rate_end: Fraction = 1.0
     """Share of `learning_rate` that is left at `max_steps`; it falls in a straight line."""
-    entropy: Weight = 0.01
-    """Weight of the policy's entropy at the start (the paper's entropy coef.)."""
-    entropy_end: Fraction = 1.0
-    """Share of `entropy` that is left at `max_steps`; it falls in a straight line."""
     grad_clip: Weight = 0.5
     """Largest norm of a gradient; longer ones are scaled down."""
     value_weight: Weight = 1.0
