@@ -155,4 +155,4 @@ def test_half_pairs_and_small_pools_are_refused() -> None:
     with pytest.raises(UserError, match=r"hsp.pool: is 3, of which 4 are to be chosen"):
         check_hsp(run(8, pool=3), spec)
     check_hsp(run(5, members="partners"), spec)
-    assert estimate_hsp(run(8), spec).together == 16
+    assert estimate_hsp(run(8, pool=8), spec).together == 16
