@@ -132,8 +132,10 @@ class PlainReporter:
         self._closed.set()
 
     def _print_phase(self) -> None:
-        whole = [] if self._expected is None else [f"about {whole_text(self._expected - self.clock())} in all"]
-        self._print_line("  ".join(self._phase.describe() + whole))
+        if self._expected is None:
+            return self._print_line("  ".join(self._phase.describe()))
+        left = self._expected - self.clock()
+        self._print_line("  ".join([*self._phase.describe(left), f"about {whole_text(left)} in all"]))
 
     def _print_line(self, text: str) -> None:
         self._heard = self.clock()
@@ -162,17 +164,37 @@ class PhaseClock:
         self.figures.update(figures)
         self._progress.update(self._id, completed=done)
 
-    def describe(self) -> list[str]:
-        """Name, share, figures, time passed and time left, as far as they are known."""
+    def describe(self, whole: float | None = None) -> list[str]:
+        """Name, share, figures, time passed and time left, as far as they are known.
+
+        A phase to its full length may seem to take longer than the `whole` work, which knows that it can end early:
+        then only that is told.
+        """
         task = self.task
         parts = [task.description]
         if task.total:
             parts.append(f"{task.percentage:.0f}%")
         parts += [figure_text(name, value) for name, value in self.figures.items()]
         parts.append(f"{clock_text(task.elapsed or 0.0)} passed")
-        if task.total and task.time_remaining is not None:
+        if task.total and task.time_remaining is not None and is_believed(task.time_remaining, whole):
             parts.append(f"about {clock_text(task.time_remaining)} left")
         return parts
+
+
+def is_believed(left: float, whole: float | None) -> bool:
+    """Whether a phase's own time left can be shown beside that of the whole work."""
+    return whole is None or left <= max(whole, 0.0)
+
+
+class PhaseColumn(TimeRemainingColumn):
+    """The phase's time left, where it is not longer than that of the whole work."""
+
+    def render(self, task: Task) -> Text:
+        """Of a task whose field `expected` is the time of the end of the whole."""
+        expected, left = task.fields.get("expected"), task.time_remaining
+        if expected is not None and left is not None and not is_believed(left, expected - task.get_time()):
+            return Text("")
+        return super().render(task)
 
 
 class WholeColumn(ProgressColumn):
@@ -199,7 +221,7 @@ class RichReporter:
             TaskProgressColumn(),
             TextColumn("{task.fields[figures]}", markup=False),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            PhaseColumn(),
             WholeColumn(),
         )
         self._fixed = bar + FIXED_WIDTH

@@ -3,14 +3,17 @@ from __future__ import annotations
 import io
 
 import pytest
+from rich.progress import Progress
 
 from popgen.progress import (
     Figure,
     NullReporter,
+    PhaseColumn,
     PlainReporter,
     RichReporter,
     clock_text,
     fit_texts,
+    is_believed,
     make_reporter,
     whole_text,
 )
@@ -121,6 +124,26 @@ def test_plain_lines_tell_of_the_whole_run_as_far_as_it_is_known() -> None:
         "member 1 of 2: self-play  10%  steps 5  0s passed",
         "member 1 of 2: self-play  20%  steps 5  40s passed  about 5:20 left  about 6 min in all",
     ]
+
+
+def test_a_phase_never_takes_longer_than_the_whole() -> None:
+    """10 % in 40 s leaves the phase 5:20 to its full length; the whole work, which may end it early, 2 min."""
+    clock, stream = Clock(), io.StringIO()
+    reporter = PlainReporter(stream, clock=clock)
+    reporter.phase("imagination", 10)
+    reporter.update(1)
+    clock.now = 40.0
+    reporter.expect(120.0)
+    reporter.update(2)
+    assert stream.getvalue().splitlines()[-1] == "imagination  20%  40s passed  about 2 min in all"
+    assert [is_believed(left, 120.0) for left in (119.0, 121.0)] == [True, False] and is_believed(1e9, None)
+    progress = Progress(disable=True, get_time=clock, speed_estimate_period=600)
+    task = progress.add_task("imagination", total=10, expected=None)
+    for clock.now, done in ((0.0, 1), (40.0, 2)):
+        progress.update(task, completed=done)
+    for expected, shown in ((None, "0:05:20"), (400.0, "0:05:20"), (160.0, "")):
+        progress.update(task, expected=expected)
+        assert PhaseColumn().render(progress.tasks[0]).plain == shown
 
 
 def test_a_silent_phase_gets_a_line_every_few_seconds() -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
 import os
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 from popgen.errors import UserError
@@ -18,7 +19,12 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raises: UserError."""
-        raise UserError("arguments", message, f"see {self.prog} --help")
+        choice = re.fullmatch(r"argument (COMMAND|WHAT|WHICH): invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if choice is None:
+            raise UserError("arguments", message, f"see {self.prog} --help")
+        found = suggest_word(choice[2], re.findall(r"[\w-]+", choice[3]))
+        fix = f"did you mean {self.prog} {found}?" if found else f"see {self.prog} --help"
+        raise UserError("arguments", f"there is no command '{self.prog} {choice[2]}'", fix)
 
 
 def add_command(
@@ -40,6 +46,21 @@ def add_command(
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     parser.set_defaults(command=command)
     return parser
+
+
+def suggest_word(word: str, known: Iterable[str]) -> str | None:
+    """The one of `known` that `word` was meant to be."""
+    return next(iter(difflib.get_close_matches(word, list(known), n=1)), None)
+
+
+def list_words(parser: argparse.ArgumentParser, words: Sequence[str]) -> tuple[str, set[str]]:
+    """The command that the first words name, as it is called, and its options."""
+    for word in words:
+        kinds = next((action for action in parser._actions if isinstance(action, argparse._SubParsersAction)), None)
+        if kinds is None or word not in kinds.choices:
+            break
+        parser = kinds.choices[word]
+    return parser.prog, {option for action in parser._actions for option in action.option_strings}
 
 
 def at_least(minimum: int) -> Callable[[str], int]:

@@ -21,7 +21,7 @@ from popgen.cli import reproduce_command as reproduction
 from popgen.cli import run_command as run
 from popgen.cli import study_commands as study
 from popgen.cli import sweep_command as sweep
-from popgen.cli.arguments import Parser, expand_home
+from popgen.cli.arguments import Parser, expand_home, list_words, suggest_word
 from popgen.cli.printing import ERROR
 from popgen.errors import UserError
 
@@ -39,7 +39,10 @@ def parse(argv: list[str]) -> argparse.Namespace:
         args.overrides = [*args.overrides, *(word for word in rest if not word.startswith("-"))]
         rest = [word for word in rest if word.startswith("-")]
     if rest:
-        raise UserError("arguments", f"unknown argument {rest[0]}", "see popgen --help")
+        command, options = list_words(parser, argv)
+        meant = suggest_word(rest[0].partition("=")[0], options)
+        fix = f"did you mean {meant}?" if meant else f"see {command} --help"
+        raise UserError("arguments", f"unknown argument {rest[0]}", fix)
     if args.command is None:
         parser.print_help(sys.stderr)
         raise SystemExit(ERROR)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from popgen.cli.arguments import expand_home, label_and_path, named_path
 from popgen.cli.compose import compose
+from popgen.cli.parser import parse
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
@@ -113,3 +115,20 @@ def test_an_origin_is_known_by_its_id() -> None:
 
     assert digest("runs/first") == digest("../x/runs/first/") == digest("/shared/runs/first")
     assert digest("runs/first") != digest("runs/second")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("rnu", "there is no command 'popgen rnu'; did you mean popgen run?"),
+        ("ego trian", "there is no command 'popgen ego trian'; did you mean popgen ego train?"),
+        ("experiment sabotage", "did you mean popgen experiment self-sabotage?"),
+        ("zzz", "there is no command 'popgen zzz'; see popgen --help"),
+        ("run --dryrun", "unknown argument --dryrun; did you mean --dry-run?"),
+        ("play x --wach 1 2", "unknown argument --wach; did you mean --watch?"),
+        ("report x --qwerty", "unknown argument --qwerty; see popgen report --help"),
+    ],
+)
+def test_a_misspelt_command_or_option_names_the_one_that_was_meant(words: str, told: str) -> None:
+    with pytest.raises(UserError, match=re.escape(told)):
+        parse(words.split())
