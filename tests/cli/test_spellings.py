@@ -126,7 +126,7 @@ def test_an_origin_is_known_by_its_id() -> None:
         ("zzz", "there is no command 'popgen zzz'; see popgen --help"),
         ("run --dryrun", "unknown argument --dryrun; did you mean --dry-run?"),
         ("play x --wach 1 2", "unknown argument --wach; did you mean --watch?"),
-        ("report x --qwerty", "unknown argument --qwerty; see popgen report --help"),
+        ("report x --zzzzz", "unknown argument --zzzzz; see popgen report --help"),
     ],
 )
 def test_a_misspelt_command_or_option_names_the_one_that_was_meant(words: str, told: str) -> None:
