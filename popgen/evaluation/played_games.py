@@ -66,7 +66,8 @@ def count_table_games(games: Sequence[TableGame]) -> dict[str, list[PlayedGame]]
             continue
         label = "people" if all(game.people) else f"people with {game.players[game.people.index(False)]}"
         counts = find_transition_events(game.env, game.states, game.actions).sum(0, dtype=np.float64)
-        names = (" and ".join(game.players),) * 2 if all(game.people) else game.players
+        together = " and ".join(game.players)
+        names = (together, together) if all(game.people) else game.players
         played = PlayedGame(game.layout, names, len(game.actions), float(game.dishes.sum()), counts, game.people)
         found.setdefault(label, []).append(played)
     return found

@@ -20,8 +20,12 @@ def run_gru(
 ) -> Float[Tensor, "T R U"]:
     """Outputs of a GRU of one layer, the last of which is its next state; a row's memory is 0 before each step where
     `is_first`."""
-    projected = F.linear(inputs, gru.weight_ih_l0, gru.bias_ih_l0)
-    outputs = _UnrolledGru.apply(projected, gru.weight_hh_l0, gru.bias_hh_l0, state, is_first)
+    names = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")
+    of_input, input_bias, of_state, state_bias = (gru.get_parameter(name) for name in names)
+    projected = F.linear(inputs, of_input, input_bias)
+    outputs: object = _UnrolledGru.apply(  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        projected, of_state, state_bias, state, is_first
+    )
     assert isinstance(outputs, Tensor)
     return outputs
 
@@ -34,7 +38,7 @@ class _UnrolledGru(torch.autograd.Function):
         """(T, R, U) outputs; projected is (T, R, 3 U), in torch's order r, z, n."""
         time, rows, wide = projected.shape
         units = wide // 3
-        anew = is_first.any(1).tolist()
+        anew: list[bool] = is_first.any(1).tolist()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
         keep = (~is_first).to(projected.dtype).unsqueeze(-1)
         recurrent = projected.new_empty(time, rows, wide)
         gates, new = projected.new_empty(time, rows, 2 * units), projected.new_empty(time, rows, units)
@@ -56,7 +60,9 @@ class _UnrolledGru(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, gradient: Tensor
+    ) -> tuple[Tensor | None, ...]:
         """Of projected, weight, bias and state."""
         weight, before, gates, new, recurrent_new, keep = ctx.saved_tensors
         time, rows, units = new.shape

@@ -53,7 +53,7 @@ def name_series(member: int | None) -> str:
     return "population" if member is None else f"member_{member:03d}"
 
 
-def count_by_kind(environment_steps: int, kinds: Mapping[str, int] | None) -> dict[str, float]:
+def count_by_kind(environment_steps: int, kinds: Mapping[str, int] | None) -> dict[str, int]:
     """The figures of `log_scaling`: environment steps so far, in all and by kind."""
     return {"environment_steps": environment_steps} | {
         f"environment_steps/{kind}": steps for kind, steps in (kinds or {}).items() if steps
@@ -150,7 +150,7 @@ class WandbTracker(NoTracker):
         """
         if self._run is not None:
             return
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         self._id = (resume or {}).get("runs", {}).get("wandb")
         try:

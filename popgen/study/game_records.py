@@ -119,8 +119,9 @@ class GameRecords:
             if found is None or found.status != OPEN:
                 values = self._plan_game(number, row.slot)
                 values |= {"participant": who.id, "attempt": 1 + (found.attempt if found else 0)}
-                game = connection.execute(games.insert().values(**values)).inserted_primary_key[0]
-                found = connection.execute(sa.select(games).where(games.c.id == game)).one()
+                key = connection.execute(games.insert().values(**values)).inserted_primary_key
+                assert key is not None
+                found = connection.execute(sa.select(games).where(games.c.id == key[0])).one()
             return OpenedGame(read_ticket(connection, found), row.station)
 
     def _plan_game(self, number: int, slot: int | None) -> dict[str, Any]:
@@ -158,7 +159,7 @@ class GameRecords:
             return
         own = participants.c.id == end.participant
         connection.execute(participants.update().where(own).values(voids=participants.c.voids + 1))
-        if connection.scalar(sa.select(participants.c.voids).where(own)) >= self.definition.voids:
+        if (connection.scalar(sa.select(participants.c.voids).where(own)) or 0) >= self.definition.voids:
             self.people.end(connection, end.participant, INACTIVE)
 
 

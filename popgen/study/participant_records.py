@@ -91,7 +91,7 @@ class ParticipantRecords:
         """
         token, row = secrets.token_urlsafe(32), self._describe_recruit(recruit)
         with self.database.write() as connection:
-            known = connection.scalar(sa.select(sa.func.count()).select_from(participants))
+            known = connection.scalar(sa.select(sa.func.count()).select_from(participants)) or 0
             if known >= self.study.definition.places:
                 raise Refused("full")
             if row and connection.execute(sa.select(participants.c.id).where(participants.c.recruit == row)).first():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,7 @@ def _check_game(connection: Connection, row: sa.Row, shelf: PartnerShelf | None)
     return CheckedGame(row.id, row.status, len(steps), problem)
 
 
-def _find_problem(row: sa.Row, steps: list[sa.Row], shelf: PartnerShelf) -> str | None:
+def _find_problem(row: sa.Row, steps: Sequence[sa.Row], shelf: PartnerShelf) -> str | None:
     policy = shelf.take()
     try:
         game = HostedGame(shelf.env, policy, row.seat, row.seed)

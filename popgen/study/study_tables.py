@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy import event
 from sqlalchemy.engine import Connection, Engine
+from sqlalchemy.exc import DatabaseError
 
 from popgen.errors import UserError
 from popgen.study.study_definition import Study
@@ -124,7 +126,7 @@ class Database:
                 metadata.create_all(connection)
                 connection.exec_driver_sql(_TRIGGER)
                 self._check_facts(connection, study)
-        except sa.exc.DatabaseError as error:
+        except DatabaseError as error:
             raise UserError(str(path), f"cannot be opened: {error.orig}", "choose another folder") from None
 
     def _check_facts(self, connection: Connection, study: Study | None) -> None:
@@ -162,13 +164,13 @@ class Database:
 def _open_engine(path: Path) -> Engine:
     engine = sa.create_engine(f"sqlite:///{path}", connect_args={"timeout": 30})
 
-    @sa.event.listens_for(engine, "connect")
+    @event.listens_for(engine, "connect")
     def prepare(connection: Any, _: Any) -> None:
         connection.isolation_level = None  # transactions begin below, not at the driver's will
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "secure_delete=ON"):
             connection.execute(f"PRAGMA {pragma}")
 
-    @sa.event.listens_for(engine, "begin")
+    @event.listens_for(engine, "begin")
     def begin(connection: Connection) -> None:
         if not connection.get_execution_options().get("popgen_read"):
             connection.exec_driver_sql("BEGIN IMMEDIATE")

@@ -144,7 +144,8 @@ class PlayRecord:
             if not own.any():
                 continue
             now = rollout.events[own].mean(0, dtype=np.float64)
-            self.habits[member] = self.habits.get(member, now) * HABIT_DECAY + (1.0 - HABIT_DECAY) * now
+            before = self.habits[member] if member in self.habits else now  # noqa: SIM401 (a type that is known)
+            self.habits[member] = before * HABIT_DECAY + (1.0 - HABIT_DECAY) * now
 
     def selection_matches(self, member: int, diversity: DiversityConfig) -> Sequence[Match]:
         """Fresh episodes with every partner, in both seatings, decide who is the strongest; the old ones are
