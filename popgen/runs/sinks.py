@@ -10,14 +10,16 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from popgen.durable_files import read_regular, replace_file
 from popgen.errors import UserError
 from popgen.runs.ledger import Ledger
-from popgen.runs.monitoring import RunLog, gauge, show_figures
 from popgen.runs.storage import Mirror
 from popgen.types import Kind, LedgerEntry
+
+if TYPE_CHECKING:
+    from popgen.runs.monitoring import RunLog
 
 
 @dataclass(frozen=True)
@@ -225,22 +227,30 @@ class GaugeSink(Sink):
 
     def on_entries(self, entries: Sequence[LedgerEntry]) -> None:
         """Totals by kind."""
+        from popgen.runs.monitoring import gauge  # it needs Ray, which a command without a run does not load
+
         for kind in Kind:
             if steps := self.ledger.steps(kind=kind):
                 gauge("popgen_environment_steps", steps, run=self.run, kind=str(kind))
 
     def on_metrics(self, point: MetricPoint) -> None:
         """The member's score, the learners' speed, room on the disk."""
+        from popgen.runs.monitoring import gauge, show_figures
+
         if point.free_bytes is not None:
             gauge("popgen_disk_free_bytes", point.free_bytes, run=self.run)
         show_figures(self.run, point.member, point.figures)
 
     def on_checkpoint(self, checkpoint: CheckpointWritten) -> None:
         """Iterations of the member in training."""
+        from popgen.runs.monitoring import gauge
+
         gauge("popgen_iteration", checkpoint.iteration, run=self.run, member=str(checkpoint.member))
 
     def on_member(self, added: MemberAdded) -> None:
         """Members in the population."""
+        from popgen.runs.monitoring import gauge
+
         gauge("popgen_members", added.member, run=self.run)
 
 
