@@ -38,6 +38,11 @@ class EgoConfig(PpoSection):
     in proportion to rank(1 / return) ** `priority`, by a running mean of which each return replaces 5 %."""
     priority: Weight = 0.5
     """Exponent of prioritised sampling."""
+    partner_noise: Fraction = 0.0
+    """Most share of a partner's actions that are random: for half of the episodes a share up to it is drawn, in the
+    others the partner plays as it is."""
+    other_starts: Fraction = 0.0
+    """Share of the episodes beside partners that begin in a state of earlier play, moved on by random actions."""
     network: Literal["features_gru", "conv_lstm"] = "features_gru"
     """`features_gru`: two linear layers and a GRU on the seat's features; `conv_lstm`: three convolutions, two linear
     layers and an LSTM on its lossless view. Both see the seat and the previous actions of both players."""
@@ -90,6 +95,11 @@ class HiptConfig(Schema):
     influence: Annotated[Number, Field(ge=1.0)] = 100.0
     """c_k: the high level is paid the mean over a segment's steps of reward + (1 - f) (c_k - 1) u, where u is the
     influence of z on the action, and f falls from 1 to 0 over training."""
+    low_influence: Weight = 0.1
+    """Weight of I(z; a) in the low level's objective, as that of its entropy; 0: as published. Without it the low
+    level has no reason to heed z: whatever the high level is paid, u is not its own to raise."""
+    low_influence_most: Weight = 0.1
+    """Nats of I(z; a) from which on the low level is paid no more."""
     first_segment: Literal["mean", "published"] = "mean"
     """`published`: the first segment of each episode is paid the sum instead, as in the published code."""
     discount: Fraction = 0.99
@@ -98,6 +108,9 @@ class HiptConfig(Schema):
     """Lambda of its advantages."""
     entropy: Weight = 0.01
     """Weight of the entropy of its choices."""
+    high_weight: Weight = 0.1
+    """Weight of the high level's loss in the sum; 1: as published. Its few decisions give the memory, which both levels
+    share, noisy gradients that take most of what `ego.grad_clip` leaves."""
 
     @model_validator(mode="after")
     def _durations_in_order(self) -> HiptConfig:

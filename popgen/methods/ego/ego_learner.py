@@ -22,8 +22,9 @@ from popgen.methods.ego.config import AugmentConfig, EgoConfig, EgoRun, HiptConf
 from popgen.methods.ego.ego_networks import EgoNet, EgoSizes
 from popgen.methods.ego.ego_policy import EgoPolicy, HierarchicalEgoPolicy
 from popgen.methods.ego.ego_rollout import Choices, Company, EgoSampler, EndedEpisode, Rollout
+from popgen.methods.ego.partner_noise import PartnerNoise
 from popgen.methods.ego.partner_seats import PartnerSeats
-from popgen.methods.ego.two_levels import advantages_of_decisions, cut_segments, pay_segments
+from popgen.methods.ego.two_levels import advantages_of_decisions, cut_segments, information_of_skill, pay_segments
 from popgen.nets.feed_forward import Sizes, ValueNet
 from popgen.nets.weights import Weights, load_optimiser_state, load_weights, optimiser_state, weights_of
 from popgen.play.policy import Policy
@@ -48,6 +49,8 @@ class EgoSetup:
     def of_run(config: EgoRun) -> EgoSetup:
         """Of a run's method."""
         levels, augment = getattr(config, "hipt", None), getattr(config, "augment", None)
+        if config.ego.other_starts and not config.plays_itself:
+            augment = AugmentConfig(share=config.ego.other_starts)
         return EgoSetup(config.ego, levels, augment, config.plays_itself)
 
     @property
@@ -140,7 +143,7 @@ class EgoLearner:
 
     def __init__(self, setup: EgoSetup, env: BatchedEnv, partners: Sequence[Policy], seed: int) -> None:
         self.setup, self.config, self.spec = setup, setup.ego, env.spec
-        seeds = [int(part >> 1) for part in np.random.SeedSequence(seed).generate_state(6)]
+        seeds = [int(part >> 1) for part in np.random.SeedSequence(seed).generate_state(7)]
         self.policy = make_policy(setup, env.spec, seeds[0])
         self.net: EgoNet = self.policy.net
         generator = torch.Generator().manual_seed(seeds[1])
@@ -153,7 +156,7 @@ class EgoLearner:
         self.sampler = EgoSampler(
             env,
             self.net,
-            _find_company(setup, env, partners, seeds[2:5]),
+            _find_company(setup, env, partners, [*seeds[2:5], seeds[6]]),
             setup.levels,
             unroll=self.config.unroll,
             sequence=self.config.sequence,
@@ -264,7 +267,10 @@ class EgoLearner:
             high = Level("high", self._critic("high"), config.clip, self.setup.levels.entropy, config.value_weight)
             choice = net.skill_logits(memory[batch["decides"]])
             lost = lose_level(high, chosen, choice, chosen["skill"], chosen["skill_log_prob"])
-            terms |= lost | {"loss": terms["loss"] + lost["loss"]}
+            levels = self.setup.levels
+            known = information_of_skill(net.skill_logits(memory).detach(), net.logits_by_skill(memory)).mean()
+            paid = levels.low_influence * known.clamp(max=levels.low_influence_most)
+            terms |= lost | {"loss": terms["loss"] + levels.high_weight * lost["loss"] - paid, "information": known}
         self.optimiser.zero_grad(set_to_none=True)
         terms["loss"].backward()
         norm = nn.utils.clip_grad_norm_(self._learned, config.grad_clip or float("inf"))
@@ -299,15 +305,15 @@ class EgoLearner:
 
 
 def _find_company(setup: EgoSetup, env: BatchedEnv, partners: Sequence[Policy], seeds: Sequence[int]) -> Company:
-    """Partners in their seats, or augmented starts, or nothing."""
+    """Partners in their seats, augmented starts and noise, where there are any."""
     count, config = env.num_envs, setup.ego
-    if not setup.self_play:
-        priority = config.priority if config.sampling == "prioritised" else None
-        seats = PartnerSeats(len(partners), count, env.spec.num_players, priority, seeds[1])
-        return Company(PartnerPool(partners, count, seeds[0]), seats)
-    if setup.augment is None:
-        return Company()
-    return Company(starts=AugmentedStarts(setup.augment, env, config.unroll, seeds[2]))
+    starts = None if setup.augment is None else AugmentedStarts(setup.augment, env, config.unroll, seeds[2])
+    if setup.self_play:
+        return Company(starts=starts)
+    priority = config.priority if config.sampling == "prioritised" else None
+    seats = PartnerSeats(len(partners), count, env.spec.num_players, priority, seeds[1])
+    noise = PartnerNoise(config.partner_noise, count, env.spec.num_actions, seeds[3]) if config.partner_noise else None
+    return Company(PartnerPool(partners, count, seeds[0]), seats, starts, noise)
 
 
 def _normalise(advantage: Tensor) -> Tensor:

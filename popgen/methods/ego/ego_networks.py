@@ -17,6 +17,10 @@ from popgen.nets.unrolled_gru import run_gru
 KERNELS = (5, 3, 3)
 """Of the convolutions that HiPT publishes."""
 
+SKILL_SPREAD = 0.3
+"""Of the first biases of z in the actor's hidden layer. At 1 they outweigh the memory, and each z is a policy that has
+to be learned almost by itself."""
+
 
 @dataclass(frozen=True)
 class EgoSizes:
@@ -106,7 +110,7 @@ class EgoNet(nn.Module):
             nn.init.orthogonal_(head.weight, 0.01)
             nn.init.zeros_(head.bias)
         if self.sizes.skills:
-            nn.init.normal_(self.skill_bias, std=1.0)
+            nn.init.normal_(self.skill_bias, std=SKILL_SPREAD)
 
     @property
     def extras(self) -> int:

@@ -2,7 +2,7 @@
 
 from popgen.methods.ego.config import BrRun, FcpRun, HiptRun, SpAugRun, SpRun
 from popgen.methods.ego.needs import check_run, estimate_needs, list_actors
-from popgen.methods.ego.recipes import BR_RECIPES, FLAT_RECIPES, HIPT_RECIPES
+from popgen.methods.ego.recipes import ALONE_RECIPES, BR_RECIPES, FLAT_RECIPES, HIPT_RECIPES
 from popgen.methods.method import Method
 
 _TRAINING = "popgen.actors.ego_workers:open_training"
@@ -66,7 +66,7 @@ SP = Method(
     colour="#999933",
     marker=">",
     config=SpRun,
-    recipes=FLAT_RECIPES,
+    recipes=ALONE_RECIPES,
     training=_TRAINING,
     actors=list_actors,
     needs=estimate_needs,
@@ -82,7 +82,7 @@ SP_AUG = Method(
     colour="#661100",
     marker="p",
     config=SpAugRun,
-    recipes=FLAT_RECIPES,
+    recipes=ALONE_RECIPES,
     training=_TRAINING,
     actors=list_actors,
     needs=estimate_needs,

@@ -13,7 +13,11 @@ _HERE: Mapping[str, Any] = {
     "run.transport": because("inline", "one learner: there is nothing to distribute; `ray` puts it in an actor"),
     "run.checkpoint_seconds": 30.0,
 }
+_BESIDE_MANY: Mapping[str, Any] = {
+    "ego.other_starts": because(0.5, "without it scores beside strangers stop rising long before those in training"),
+}
 _WHOLE_EPISODES: Mapping[str, Any] = {
+    **_BESIDE_MANY,
     "ego.unroll": because(400, "whole episodes: no segment of the high level is cut"),
     "ego.envs": because(64, "as many steps to an update as 128 environments with 200"),
     "ego.minibatches": 8,
@@ -82,6 +86,7 @@ def _make_recipes(own: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]])
     return {recipe.name: recipe for recipe in (laptop, demo, published, smoke)}
 
 
-FLAT_RECIPES = _make_recipes({}, {})
+FLAT_RECIPES = _make_recipes(_BESIDE_MANY, {})
+ALONE_RECIPES = _make_recipes({}, {})
 BR_RECIPES = _make_recipes({"ego.steps": because(600_000, "one partner: one convention to learn"), "ego.envs": 64}, {})
 HIPT_RECIPES = _make_recipes(_WHOLE_EPISODES, _SKILLS)

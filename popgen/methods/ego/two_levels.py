@@ -23,6 +23,16 @@ def influence_of_skill(
     return (chosen.exp() * (chosen - mixture)).sum(-1)
 
 
+def information_of_skill(
+    skill_logits: Float[Tensor, "*rows K"], action_logits: Float[Tensor, "*rows K A"]
+) -> Float[Tensor, "*rows"]:
+    """I(z; a | h) = sum_z pi_hi(z | h) u(z), the mean of `influence_of_skill` over the choices."""
+    log_actions = torch.log_softmax(action_logits, -1)
+    weights = torch.log_softmax(skill_logits, -1).unsqueeze(-1)
+    mixture = torch.logsumexp(log_actions + weights, -2, keepdim=True)
+    return ((log_actions + weights).exp() * (log_actions - mixture)).sum((-2, -1))
+
+
 def draw_durations(count: int, least: int, most: int, generator: torch.Generator) -> Int[Tensor, " R"]:
     """Steps for which a z is kept: even over least, ..., most."""
     return torch.randint(least, most + 1, (count,), generator=generator)

@@ -13,6 +13,7 @@ from popgen.methods.ego.two_levels import (
     cut_segments,
     draw_durations,
     influence_of_skill,
+    information_of_skill,
     pay_segments,
 )
 
@@ -36,6 +37,19 @@ def test_influence_is_the_divergence_from_the_mixture() -> None:
 def test_a_skill_that_changes_nothing_has_no_influence() -> None:
     logits = torch.randn(5, 1, 6).expand(5, 4, 6)
     assert influence_of_skill(torch.randn(5, 4), logits, torch.tensor([0, 1, 2, 3, 0])).abs().max() < 1e-6
+
+
+def test_information_is_the_mean_influence_and_has_a_gradient_where_skills_differ() -> None:
+    generator = torch.Generator().manual_seed(0)
+    high = torch.randn(7, 3, generator=generator)
+    low = torch.randn(7, 3, 6, generator=generator).requires_grad_()
+    got = information_of_skill(high, low)
+    by_skill = torch.stack([influence_of_skill(high, low, torch.full((7,), z)) for z in range(3)], -1)
+    torch.testing.assert_close(got, (high.softmax(-1) * by_skill).sum(-1))
+    before = got.mean()
+    before.backward()
+    assert low.grad is not None
+    assert information_of_skill(high, low.detach() + low.grad).mean() > before
 
 
 def test_durations_are_even_over_both_ends() -> None:
