@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too."""
     for item in items:

@@ -122,7 +122,9 @@ def test_members_act_and_their_figures_are_told(whole: Path) -> None:
     population = load_population(whole / "population")
     assert [info.kind for info in population.members] == ["feed_forward"] * 3
     env = population.make_env(5, 0)
-    actions = population[3].act(env.observe(), np.zeros((5, 2), np.uint8), np.ones(5, bool))
+    member = population[3]
+    member.reset(batch=5, seed=0)
+    actions = member.act(env.observe(), np.zeros((5, 2), np.uint8), np.ones(5, bool))
     assert actions.shape == (5, 2)
     assert {name.split(".")[1] for name in population.training(3)} == {"self", "cross"}
     rows = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
