@@ -245,7 +245,8 @@ def _check_start(config: RunConfig, spec: EnvSpec, method: Method) -> None:
 
 
 def _check_shapes(config: RunConfig, run: Path, continuation: Continuation) -> None:
-    """The origin's networks must have our sizes; its config.json may be of another version in all else."""
+    """The origin's networks must have our sizes; its config.json may be of another version in all else, and what it
+    does not name was then as the schema's default is."""
     path = run / "config.json"
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))
@@ -257,8 +258,9 @@ def _check_shapes(config: RunConfig, run: Path, continuation: Continuation) -> N
         part = origin.get(section) if isinstance(origin, dict) else None
         if not isinstance(part, dict):
             raise UserError("population.init_from", f"{path} has no {section!r}", "give a run's folder")
+        defaults = type(getattr(config, section))().model_dump(mode="json")
         for name in names:
-            there, here = part.get(name), ours[section][name]
+            there, here = part.get(name, defaults[name]), ours[section][name]
             if there != here:
                 raise UserError(f"{section}.{name}", f"is {here!r}, but {there!r} in {run}", "use the same sizes")
     section, name = continuation.capacity

@@ -242,6 +242,10 @@ def test_a_start_is_compared_by_its_own_config_which_may_be_of_another_version(
     assert run(*DRY, *start)[0] == 0
     for name in ("decoder_layers", "prior_layers", "head_layers"):  # none of them in the members' own records
         refused(run("run", *start, f"world_model.{name}=7"), f"world_model.{name}", "is 7, but 1")
+    del known["world_model"]["reward_head"]  # of a version without that choice
+    path.write_text(json.dumps(known))
+    assert run(*DRY, *start)[0] == 0
+    refused(run("run", *start, "world_model.reward_head=scalar"), "world_model.reward_head", "but 'events'")
     refused(run("run", *start, "replay.capacity=19999"), "replay.capacity", "20,000")
     for content in ("", "[]", '{"world_model": 1}'):
         path.write_text(content)
