@@ -48,7 +48,7 @@ def make_all(pieces: Pieces, reporter: Reporter) -> dict[str, Record]:
     for job in jobs:
         for name in job.measures if job.done else ():
             if not pieces.is_measured(job, name):
-                _attempt(job, lambda job=job, name=name: _measure(pieces, job, name))
+                _attempt(job, lambda job=job, name=name: _measure_run(pieces, job, name))
     return {target.name: _write_target(pieces, target) for target in pieces.plan.targets}
 
 
@@ -84,7 +84,7 @@ def _configure_ego(pieces: Pieces, job: Job) -> RunConfig:
     return make_ego_config(method, [str(teacher.folder / "population")], settings, scale=pieces.plan.budget.scale)
 
 
-def _measure(pieces: Pieces, job: Job, name: str) -> None:
+def _measure_run(pieces: Pieces, job: Job, name: str) -> None:
     holdouts = {one.row: pieces.find_job(one).folder for one in job.wanted.holdouts}
     if missing := [title for title, folder in holdouts.items() if not is_finished(folder)]:
         raise UserError(name, f"needs {missing[0]}", "finish that run first")

@@ -67,7 +67,7 @@ def reproduce(args: argparse.Namespace) -> int:
     from popgen.pipelines.reproduce import make_all
     from popgen.progress import make_reporter
 
-    work = _plan(args)
+    work = _plan_pieces(args)
     if args.dry_run:
         return _print_state(work, args)
     if not args.quiet:
@@ -75,7 +75,7 @@ def reproduce(args: argparse.Namespace) -> int:
     with closing(make_reporter(quiet=args.quiet)) as reporter:
         records = make_all(work, reporter)
     if args.publish is not None:
-        _publish(records, Path(args.publish))
+        _publish_records(records, Path(args.publish))
     if args.results is not None:
         _write_page(Path(args.results))
     code = _print_state(work, args)
@@ -85,7 +85,7 @@ def reproduce(args: argparse.Namespace) -> int:
     return code
 
 
-def _plan(args: argparse.Namespace) -> Pieces:
+def _plan_pieces(args: argparse.Namespace) -> Pieces:
     from popgen.pipelines.reproduction_pieces import Pieces, Plan
     from popgen.reports.reproduction.target_registry import find_targets
     from popgen.runs.preflight import check_root
@@ -205,7 +205,7 @@ def _print_screen(work: Pieces, *, to_stderr: bool) -> None:
     print(text)
 
 
-def _publish(records: dict[str, Any], folder: Path) -> None:
+def _publish_records(records: dict[str, Any], folder: Path) -> None:
     """Records with runs, as files of less than MOST_BYTES."""
     from popgen.durable_files import replace_file
     from popgen.reports.reproduction.results_page import MOST_BYTES, to_record_text

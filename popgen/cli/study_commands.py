@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import socket
 import sys
 from pathlib import Path
 from typing import Any
@@ -146,6 +145,7 @@ def serve_study_pages(args: argparse.Namespace) -> int:
     bound_threads(1)
     from filelock import FileLock, Timeout
 
+    from popgen.pages.game_server import open_listening_socket
     from popgen.study.study_definition import read_study
     from popgen.study.study_server import StudyServer, open_service, serve_study
 
@@ -156,7 +156,7 @@ def serve_study_pages(args: argparse.Namespace) -> int:
     except Timeout:
         raise UserError(args.study, "is being served already", "end the other server") from None
     try:
-        listening = _listen(args.host, args.port)
+        listening = open_listening_socket(args.host, args.port)
         service = open_service(study, speed=args.speed)
         host = f"[{args.host}]" if ":" in args.host else args.host
         print(f"study at http://{host}:{listening.getsockname()[1]} (end with Ctrl-C)", flush=True)
@@ -213,17 +213,6 @@ def simulate_study(args: argparse.Namespace) -> int:
             f"{found.kills} kills, {told['breaks']} connections broke, {told['most_lost']} steps lost at most at once"
         )
     return OK
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((host, port))
-    except OSError as error:
-        listening.close()
-        raise UserError("--port", f"cannot listen at {host}:{port} ({error.strerror})", "choose another one") from None
-    return listening
 
 
 def verify_study(args: argparse.Namespace) -> int:

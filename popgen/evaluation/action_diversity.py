@@ -143,10 +143,10 @@ def measure_actions(
     divergence = _mean_of_games(_diverge(torch.stack(answers.chosen, 1), counted, episodes, kernel), counted, episodes)
     return ActionDiversity(
         members=len(policies),
-        entropy=_interval(entropy),
-        own_entropy=_interval(own),
-        actions=_interval(entropy - own),
-        trajectories=_interval(divergence),
+        entropy=_estimate_interval(entropy),
+        own_entropy=_estimate_interval(own),
+        actions=_estimate_interval(entropy - own),
+        trajectories=_estimate_interval(divergence),
         most=math.log(len(policies)),
         steps=played.steps,
     )
@@ -194,6 +194,6 @@ def _mean_of_games(values: Tensor, counted: Tensor, episodes: int) -> np.ndarray
     return means.reshape(-1, episodes).numpy()
 
 
-def _interval(games: np.ndarray) -> Interval:
+def _estimate_interval(games: np.ndarray) -> Interval:
     """Over members and their games (K, N)."""
     return bootstrap_interval(games.T, lambda drawn: float(np.mean(drawn)), over_tasks=True)

@@ -189,6 +189,22 @@ async def _stop_task(task: asyncio.Task[None] | None) -> None:
         await asyncio.gather(task, return_exceptions=True)
 
 
+def open_listening_socket(host: str, port: int) -> socket.socket:
+    """A bound socket; port 0 takes a free one.
+
+    Raises:
+        UserError: the port is taken, or not ours to take.
+    """
+    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+    except OSError as error:
+        listening.close()
+        raise UserError("--port", f"cannot listen at {host}:{port} ({error.strerror})", "choose another one") from None
+    return listening
+
+
 def serve_games(server: GameServer, host: str, port: int, tell: Callable[[str], None]) -> None:
     """Serve until interrupted.
 
@@ -202,13 +218,7 @@ def serve_games(server: GameServer, host: str, port: int, tell: Callable[[str], 
     """
     import uvicorn
 
-    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((host, port))
-    except OSError as error:
-        listening.close()
-        raise UserError("--port", f"cannot listen at {host}:{port} ({error.strerror})", "choose another one") from None
+    listening = open_listening_socket(host, port)
     tell(f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}")
     config = uvicorn.Config(server.build_app(), log_level="warning", ws_max_size=LARGEST_MESSAGE, lifespan="off")
     uvicorn.Server(config).run(sockets=[listening])

@@ -39,7 +39,7 @@ def measure_diversity(events: np.ndarray) -> Diversity:
     Args:
         events: (K, F) mean counts; each column is divided by its maximum (and a margin) before K = Phi Phi^T.
     """
-    gram = _gram(events)
+    gram = _compute_gram(events)
     values = np.clip(np.linalg.eigvalsh(gram), 0.0, None)
     sign, log_determinant = np.linalg.slogdet(gram)
     shares = values / values.sum() if values.sum() > 0.0 else np.full(len(values), 1.0 / len(values))
@@ -57,7 +57,7 @@ def choose_most_diverse(events: np.ndarray, count: int) -> list[int]:
     Raises:
         ValueError: more partners wanted than there are.
     """
-    gram = _gram(events)
+    gram = _compute_gram(events)
     size = len(gram)
     if not 1 <= count <= size:
         raise ValueError(f"count: {count} of {size} partners cannot be chosen")
@@ -113,7 +113,7 @@ def _exchange_rows(gram: np.ndarray, chosen: list[int]) -> list[int]:
     return chosen
 
 
-def _gram(events: np.ndarray) -> np.ndarray:
+def _compute_gram(events: np.ndarray) -> np.ndarray:
     scaled = _scale_columns(events)
     return scaled @ scaled.T
 

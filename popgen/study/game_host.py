@@ -157,7 +157,7 @@ class ServerGameHost:
         self._due: list[tuple[float, int]] = []
         self._wake = threading.Condition()
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="popgen-games", daemon=True)
+        self._thread = threading.Thread(target=self._run_games, name="popgen-games", daemon=True)
         self._thread.start()
 
     def open(self, ticket: GameTicket, place: int, tell: Tell, *, pictures: bool) -> None:
@@ -171,7 +171,7 @@ class ServerGameHost:
             self._games[ticket.id] = one
         tell(begun)
         if one.game.step >= ticket.steps:  # killed between the last step and the end
-            self._finish(one, FINISHED)
+            self._finish_game(one, FINISHED)
 
     def receive(self, game: int, message: GameMessage) -> None:
         """See `GameHost`."""
@@ -190,10 +190,10 @@ class ServerGameHost:
                 one.running, one.idle = True, 0
                 one.due = self.clock() + self.pace.period
                 if self.pace.period > 0:
-                    self._schedule(one)
+                    self._schedule_game(one)
             if self.pace.period == 0 and one.running and message.ready == one.game.step:
                 one.due = self.clock()
-                self._schedule(one)
+                self._schedule_game(one)
 
     def close(self, game: int) -> None:
         """See `GameHost`."""
@@ -214,12 +214,12 @@ class ServerGameHost:
         self._thread.join()
         self._writer.stop()
 
-    def _schedule(self, one: _RunningGame) -> None:
+    def _schedule_game(self, one: _RunningGame) -> None:
         """Call with `_wake` held."""
         heapq.heappush(self._due, (one.due, one.ticket.id))
         self._wake.notify()
 
-    def _run(self) -> None:
+    def _run_games(self) -> None:
         """The thread of all games."""
         while True:
             with self._wake:
@@ -234,9 +234,9 @@ class ServerGameHost:
                 planned = one.take_step(self.clock() - due)
             with one.busy:
                 if not one.over:
-                    self._step(one, planned)
+                    self._step_game(one, planned)
 
-    def _step(self, one: _RunningGame, planned: _PlannedStep) -> None:
+    def _step_game(self, one: _RunningGame, planned: _PlannedStep) -> None:
         try:
             played = one.game.advance(planned.action)
         except Exception:  # one game's failure must not end the others'
@@ -260,9 +260,9 @@ class ServerGameHost:
         one.sent = {one.game.step: self.clock()} if one.game.step % 4 == 0 else one.sent
         one.tell(one.describe())
         if one.game.step >= one.ticket.steps:
-            self._finish(one, FINISHED)
+            self._finish_game(one, FINISHED)
         elif one.idle >= self.pace.end_steps:
-            self._finish(one, VOID)
+            self._finish_game(one, VOID)
         else:
             self._plan_next(one)
 
@@ -276,9 +276,9 @@ class ServerGameHost:
             now = self.clock()
             if now - one.due > LATE_LIMIT * self.pace.period:
                 one.due = now
-            self._schedule(one)
+            self._schedule_game(one)
 
-    def _finish(self, one: _RunningGame, status: str) -> None:
+    def _finish_game(self, one: _RunningGame, status: str) -> None:
         """The browser hears of the end once it is recorded."""
         one.running, one.over = False, True
         end = GameEnd(one.ticket.id, one.ticket.participant, one.place, status, one.game.score)
@@ -299,7 +299,7 @@ class _RecordWriter:
         self._after: list[Callable[[], None]] = []
         self._ready = threading.Condition()
         self._hurry = self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="popgen-records", daemon=True)
+        self._thread = threading.Thread(target=self._run_writer, name="popgen-records", daemon=True)
         self._thread.start()
 
     def put(self, row: Tick | GameEnd, after: Callable[[], None] | None = None) -> None:
@@ -327,7 +327,7 @@ class _RecordWriter:
             self._ready.notify()
         self._thread.join()
 
-    def _run(self) -> None:
+    def _run_writer(self) -> None:
         while True:
             with self._ready:
                 while not (self._rows or self._after or self._stopping):

@@ -134,7 +134,7 @@ class ParticipantRecords:
 
     def consent(self, who: Participant, *, agreed: bool, version: str) -> None:
         """Take or refuse part; raises Refused for another version of the text, or at another station."""
-        self._expect(who, "consent")
+        self._expect_station(who, "consent")
         if version != self.study.definition.consent_version:
             raise Refused("outdated")
         with self.database.write() as connection:
@@ -149,7 +149,7 @@ class ParticipantRecords:
 
     def read_instructions(self, who: Participant) -> None:
         """Go on to the comprehension check."""
-        self._expect(who, "instructions")
+        self._expect_station(who, "instructions")
         with self.database.write() as connection:
             self.move_on(connection, who.id, who.place)
 
@@ -232,6 +232,6 @@ class ParticipantRecords:
         self.database.wipe_log()
         return True
 
-    def _expect(self, who: Participant, kind: str) -> None:
+    def _expect_station(self, who: Participant, kind: str) -> None:
         if who.status != ACTIVE or who.station.kind != kind:
             raise Refused("elsewhere")

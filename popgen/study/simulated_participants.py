@@ -153,9 +153,9 @@ class SimulatedParticipant:
         return {key: right.get(key) or value for key, value in drawn.items()}
 
     async def _call(self, name: str, body: Any = None) -> dict[str, Any]:
-        return await asyncio.to_thread(self._request, name, body)
+        return await asyncio.to_thread(self._send_request, name, body)
 
-    def _request(self, name: str, body: Any) -> dict[str, Any]:
+    def _send_request(self, name: str, body: Any) -> dict[str, Any]:
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(
             f"http://{self._address}/api/{name}", data, {"Content-Type": "application/json"}
@@ -177,7 +177,7 @@ class SimulatedParticipant:
         begun = json.loads(await line.recv())
         facts, step = begun["begin"], begun["step"]
         self._note_break(facts["number"], step)
-        env, policy = self._casting.env(facts["layout"]), self._policy(facts["layout"])
+        env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
         policy.reset(1, int(self._rng.integers(2**31)))
         previous, first = np.zeros((1, 2), np.uint8), True
         codes = {number: KEYS[name] for number, name in enumerate(env.spec.action_names) if name in KEYS}
@@ -194,7 +194,7 @@ class SimulatedParticipant:
             self.visit.steps += "state" in told
         self.visit.games += 1
 
-    def _policy(self, layout: str) -> Policy:
+    def _load_policy(self, layout: str) -> Policy:
         if layout not in self._policies:
             self._policies[layout] = self._casting.draw(layout, self._rng)
         return self._policies[layout]

@@ -157,9 +157,9 @@ class StudyServer:
         """Begin, unless this browser has begun."""
         body = await _read_body(request, messages.SessionBody)
         if await self._find(request) is not None:
-            return _moved()
+            return _answer_moved()
         token = await asyncio.to_thread(self.people.begin_session, body.recruit)
-        answer = _moved()
+        answer = _answer_moved()
         answer.set_cookie(COOKIE, token, max_age=7 * 86_400, httponly=True, samesite="strict", secure=self.secure)
         return answer
 
@@ -168,13 +168,13 @@ class StudyServer:
         body = await _read_body(request, messages.ConsentBody)
         who = await self._need(request)
         await asyncio.to_thread(self.people.consent, who, agreed=body.agreed, version=body.version)
-        return _moved()
+        return _answer_moved()
 
     async def post_instructions(self, request: Request) -> Response:
         """The instructions are read."""
         await _read_body(request, messages.EmptyBody)
         await asyncio.to_thread(self.people.read_instructions, await self._need(request))
-        return _moved()
+        return _answer_moved()
 
     async def post_answers(self, request: Request) -> Response:
         """Answers to a form; a comprehension check that was not passed is shown again, after the instructions."""
@@ -189,9 +189,9 @@ class StudyServer:
         await self._hang_up(who.id, "elsewhere")
         if not body.delete:
             await asyncio.to_thread(self.people.withdraw, who)
-            return _moved()
+            return _answer_moved()
         await asyncio.to_thread(self.people.delete, who.code)
-        answer = _moved()
+        answer = _answer_moved()
         answer.delete_cookie(COOKIE)
         return answer
 
@@ -415,7 +415,7 @@ async def _read_body(request: Request, kind: type[B]) -> B:
     return kind.model_validate_json(await request.body())
 
 
-def _moved() -> Response:
+def _answer_moved() -> Response:
     return JSONResponse({"ok": True})
 
 

@@ -72,17 +72,17 @@ def to_section(record: Record, level: int = 2) -> str:
     target = TARGETS[record["target"]]
     lines = [f"{'#' * level} {target.title}", ""]
     if target.source:
-        lines += [_wrap(f"The paper's {target.source}: {target.claim}"), ""]
+        lines += [_wrap_text(f"The paper's {target.source}: {target.claim}"), ""]
     lines += ["```sh", record["command"], "```", ""]
     for sheet in make_sheets(record, target):
         lines += [f"{sheet.title}:", "", sheet.to_markdown(), ""]
-    lines += [_wrap(note, "- ") for note in (*target.notes, *_list_origins(record))]
-    lines += [_wrap(text, "- ") for text in _list_missing(record)]
+    lines += [_wrap_text(note, "- ") for note in (*target.notes, *_list_origins(record))]
+    lines += [_wrap_text(text, "- ") for text in _list_missing(record)]
     lines += ["", make_run_sheet(record, target).to_markdown(), ""]
     return "\n".join(lines)
 
 
-def _wrap(text: str, start: str = "") -> str:
+def _wrap_text(text: str, start: str = "") -> str:
     return textwrap.fill(
         text,
         WIDTH,
