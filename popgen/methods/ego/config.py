@@ -38,9 +38,6 @@ class EgoConfig(PpoSection):
     in proportion to rank(1 / return) ** `priority`, by a running mean of which each return replaces 5 %."""
     priority: Weight = 0.5
     """Exponent of prioritised sampling."""
-    partner_noise: Fraction = 0.0
-    """Most share of a partner's actions that are random: for half of the episodes a share up to it is drawn, in the
-    others the partner plays as it is."""
     other_starts: Fraction = 0.0
     """Share of the episodes beside partners that begin in a state of earlier play, moved on by random actions."""
     network: Literal["features_gru", "conv_lstm"] = "features_gru"

@@ -22,7 +22,6 @@ from popgen.methods.ego.config import AugmentConfig, EgoConfig, EgoRun, HiptConf
 from popgen.methods.ego.ego_networks import EgoNet, EgoSizes
 from popgen.methods.ego.ego_policy import EgoPolicy, HierarchicalEgoPolicy
 from popgen.methods.ego.ego_rollout import Choices, Company, EgoSampler, EndedEpisode, Rollout
-from popgen.methods.ego.partner_noise import PartnerNoise
 from popgen.methods.ego.partner_seats import PartnerSeats
 from popgen.methods.ego.two_levels import advantages_of_decisions, cut_segments, information_of_skill, pay_segments
 from popgen.nets.feed_forward import Sizes, ValueNet
@@ -143,7 +142,7 @@ class EgoLearner:
 
     def __init__(self, setup: EgoSetup, env: BatchedEnv, partners: Sequence[Policy], seed: int) -> None:
         self.setup, self.config, self.spec = setup, setup.ego, env.spec
-        seeds = [int(part >> 1) for part in np.random.SeedSequence(seed).generate_state(7)]
+        seeds = [int(part >> 1) for part in np.random.SeedSequence(seed).generate_state(6)]
         self.policy = make_policy(setup, env.spec, seeds[0])
         self.net: EgoNet = self.policy.net
         generator = torch.Generator().manual_seed(seeds[1])
@@ -156,7 +155,7 @@ class EgoLearner:
         self.sampler = EgoSampler(
             env,
             self.net,
-            _find_company(setup, env, partners, [*seeds[2:5], seeds[6]]),
+            _find_company(setup, env, partners, seeds[2:5]),
             setup.levels,
             unroll=self.config.unroll,
             sequence=self.config.sequence,
@@ -305,15 +304,14 @@ class EgoLearner:
 
 
 def _find_company(setup: EgoSetup, env: BatchedEnv, partners: Sequence[Policy], seeds: Sequence[int]) -> Company:
-    """Partners in their seats, augmented starts and noise, where there are any."""
+    """Partners in their seats, and augmented starts, where there are any."""
     count, config = env.num_envs, setup.ego
     starts = None if setup.augment is None else AugmentedStarts(setup.augment, env, config.unroll, seeds[2])
     if setup.self_play:
         return Company(starts=starts)
     priority = config.priority if config.sampling == "prioritised" else None
     seats = PartnerSeats(len(partners), count, env.spec.num_players, priority, seeds[1])
-    noise = PartnerNoise(config.partner_noise, count, env.spec.num_actions, seeds[3]) if config.partner_noise else None
-    return Company(PartnerPool(partners, count, seeds[0]), seats, starts, noise)
+    return Company(PartnerPool(partners, count, seeds[0]), seats, starts)
 
 
 def _normalise(advantage: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec
-from popgen.nets.unrolled_gru import run_gru
 
 KERNELS = (5, 3, 3)
 """Of the convolutions that HiPT publishes."""
@@ -151,11 +150,8 @@ class EgoNet(nn.Module):
     ) -> Remembered:
         """Run the memory over T steps; a row forgets everything before each step where `is_first`.
 
-        An LSTM is one call for all rows between two steps at which any row begins anew.
+        Between two steps at which any row begins anew all rows are one call.
         """
-        if isinstance(self.memory, nn.GRU):
-            outputs_of_all = run_gru(self.memory, encoded, state, is_first)
-            return Remembered(outputs_of_all, outputs_of_all[-1])
         starts = [t for t, anew in enumerate(is_first.any(1).tolist()) if anew or t == 0]
         outputs: list[Tensor] = []
         for begin, end in zip(starts, [*starts[1:], len(encoded)], strict=True):
@@ -165,9 +161,12 @@ class EgoNet(nn.Module):
         return Remembered(outputs[0] if len(outputs) == 1 else torch.cat(outputs), state)
 
     def _advance(self, encoded: Tensor, state: Tensor) -> Remembered:
-        before = tuple(part.contiguous().unsqueeze(0) for part in state.chunk(2, -1))
-        output, (hidden, cell) = self.memory(encoded, before)
-        return Remembered(output, torch.cat([hidden, cell], -1).squeeze(0))
+        if isinstance(self.memory, nn.LSTM):
+            before = tuple(part.contiguous().unsqueeze(0) for part in state.chunk(2, -1))
+            output, (hidden, cell) = self.memory(encoded, before)
+            return Remembered(output, torch.cat([hidden, cell], -1).squeeze(0))
+        output, hidden = self.memory(encoded, state.unsqueeze(0))
+        return Remembered(output, hidden.squeeze(0))
 
     def action_logits(
         self, memory: Float[Tensor, "*rows U"], skill: Int[Tensor, "*rows"] | None = None

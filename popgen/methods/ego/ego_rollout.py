@@ -20,7 +20,6 @@ from popgen.envs.reward import training_reward
 from popgen.methods.ego.augmented_starts import AugmentedStarts
 from popgen.methods.ego.config import HiptConfig
 from popgen.methods.ego.ego_networks import EgoNet
-from popgen.methods.ego.partner_noise import PartnerNoise
 from popgen.methods.ego.partner_seats import PartnerSeats
 from popgen.methods.ego.two_levels import draw_durations, influence_of_skill
 from popgen.nets.blocks import draw_by_gumbel
@@ -92,18 +91,16 @@ class Company:
     Attributes:
         pool: how the partners act. seats: who sits where.
         starts: other start states than the environment's, None for none.
-        noise: of the partners' actions, None for none.
     """
 
     pool: PartnerPool | None = None
     seats: PartnerSeats | None = None
     starts: AugmentedStarts | None = None
-    noise: PartnerNoise | None = None
 
     @property
-    def parts(self) -> dict[str, PartnerPool | PartnerSeats | AugmentedStarts | PartnerNoise]:
+    def parts(self) -> dict[str, PartnerPool | PartnerSeats | AugmentedStarts]:
         """Those that there are, each with a state of its own."""
-        parts = {"pool": self.pool, "seats": self.seats, "starts": self.starts, "noise": self.noise}
+        parts = {"pool": self.pool, "seats": self.seats, "starts": self.starts}
         return {name: part for name, part in parts.items() if part is not None}
 
 
@@ -241,9 +238,7 @@ class EgoSampler:
         actions = np.empty((self.env.num_envs, 2), np.uint8)
         rows = np.arange(self.env.num_envs)
         actions[rows, 1 - seat] = own
-        theirs = self.company.pool.act(seen, self._previous, self._first, partner, seat)
-        noise = self.company.noise
-        actions[rows, seat] = theirs if noise is None else noise.blur_actions(theirs, self._first)
+        actions[rows, seat] = self.company.pool.act(seen, self._previous, self._first, partner, seat)
         return actions
 
     def _note_cuts(self, columns: dict[str, list[Any]], step: int, envs: np.ndarray) -> None:

@@ -13,7 +13,6 @@ from popgen.methods.ego.augmented_starts import AugmentedStarts
 from popgen.methods.ego.config import AugmentConfig, EgoConfig, HiptConfig
 from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup
 from popgen.methods.ego.ego_networks import EgoSizes, build_network
-from popgen.methods.ego.partner_noise import PartnerNoise
 from popgen.methods.ego.partner_seats import PartnerSeats
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.simple_policies import RandomPolicy
@@ -27,7 +26,7 @@ LEVELS = HiptConfig(skills=3, duration_least=2, duration_most=4)
 SETUPS = {
     "fcp": EgoSetup(EgoConfig(**SMALL)),
     "prioritised": EgoSetup(EgoConfig(**SMALL, sampling="prioritised")),
-    "varied": EgoSetup(EgoConfig(**SMALL, partner_noise=0.5), augment=AugmentConfig(kept=16)),
+    "varied": EgoSetup(EgoConfig(**SMALL), augment=AugmentConfig(kept=16)),
     "hipt": EgoSetup(EgoConfig(**SMALL), levels=LEVELS),
     "conv": EgoSetup(EgoConfig(**SMALL, network="conv_lstm", channels=2), levels=LEVELS),
     "sp": EgoSetup(EgoConfig(**SMALL), self_play=True),
@@ -119,15 +118,6 @@ def test_partners_share_the_seats_evenly_or_by_rank() -> None:
     assert ranked.probabilities().tolist() == [0.1, 0.3, 0.2, 0.4]
     ranked.note_returns(np.array([0]), np.array([24.0]))
     assert ranked.mean[0] == 5.0
-
-
-def test_noise_is_of_the_share_that_was_drawn_and_absent_in_half_of_the_episodes() -> None:
-    noise = PartnerNoise(0.6, 400, 6, 0)
-    first, always = np.ones(400, bool), np.full(400, 7, np.uint8)
-    played = np.stack([noise.blur_actions(always, first & (step == 0)) for step in range(300)])
-    share = (played != 7).mean(0)
-    assert 160 < (share == 0.0).sum() < 240 and played[played != 7].max() == 5
-    assert share.max() < 0.7 and abs(share[share > 0].mean() - 0.3) < 0.05
 
 
 def test_augmented_starts_are_states_of_play_moved_on() -> None:
