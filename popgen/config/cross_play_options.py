@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from popgen.config.schema import Fraction, Number, Schema, Weight
+from popgen.config.schema import Number, Schema, Weight
 
 
 class CrossPlayOptions(Schema):
@@ -13,5 +13,6 @@ class CrossPlayOptions(Schema):
     xp_limit: Number | None = None
     """A score: cross-play with a partner is pressed down until it is there, by a multiplier of lambda_XP; null: always.
     """
-    multiplier_step: Fraction = 0.5
-    """Step of that multiplier, in [0, 1], each time that real scores with the partner arrive."""
+    multiplier_step: Weight = 0.5
+    """Step of that multiplier, which stays in [0, 1], each time that real scores with the partner arrive: for
+    cross-play as good as self-play. Above 1 where scores cannot go far below the limit, as beside 0 dishes."""
