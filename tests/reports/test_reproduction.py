@@ -43,11 +43,11 @@ def sabotage(seed: int, exits: float, xp: float) -> dict[str, Any]:
 
 
 def test_an_interval_over_seeds_is_students() -> None:
-    """1, 2, 3: mean 2, deviation 1, 4.303 / sqrt(3) = 2.4843 either way."""
+    """1, 2, 3: mean 2, deviation 1, 4.3027 / sqrt(3) = 2.4841 either way."""
     found = take_interval([1.0, 2.0, 3.0])
     assert found is not None and found.mean == 2.0
-    assert found.high == pytest.approx(4.4843, abs=1e-4) and found.low == pytest.approx(-0.4843, abs=1e-4)
-    assert found.to_text(1) == "2.0 (-0.5 to 4.5)"
+    assert found.high == pytest.approx(4.4841, abs=1e-4) and found.low == pytest.approx(-0.4841, abs=1e-4)
+    assert found.to_text(1) == "2.0 ± 2.5"
     one = take_interval([5.0])
     assert one is not None and one.to_text(2) == "5.00" and take_interval([]) is None
 

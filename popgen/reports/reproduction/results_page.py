@@ -22,8 +22,8 @@ WIDTH = 100
 _HEAD = f"""# Measured results
 
 `popgen reproduce` wrote this page from the records in `docs/results/`; no number is typed by hand.
-`popgen reproduce --results docs/results.md` writes it again. A cell is the mean over seeds with its
-interval at {LEVEL} (Student's t) in brackets, or the one seed's figure; "-" was not measured. Rows
+`popgen reproduce --results docs/results.md` writes it again. A cell is the mean over seeds ± half the
+width of its {LEVEL} interval (Student's t), or the one seed's figure; "-" was not measured. Rows
 marked (paper) are the paper's. Figures of earlier runs whose records were not kept are in
 [earlier measurements](notes/measurements.md).
 """

@@ -14,8 +14,6 @@ from popgen.reports.frames import UNKNOWN, Sheet, to_csv
 from popgen.reports.reproduction.target_records import Column, PaperLine, Record, Target
 
 LEVEL = "95 %"
-_QUANTILES = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-"""Of Student's t at 97.5 %, for 1 to 9 degrees of freedom; 1.96 beyond."""
 
 
 @dataclass(frozen=True)
@@ -24,20 +22,29 @@ class Interval:
 
     Attributes:
         mean: of them.
-        low, high: of the mean's interval at LEVEL by Student's t, which takes seeds as normal; the mean for one seed.
+        half: width of the mean's interval at LEVEL to either side, by Student's t, which takes seeds as normal; 0 for
+            one seed.
         seeds: how many have the figure.
     """
 
     mean: float
-    low: float
-    high: float
+    half: float
     seeds: int
 
+    @property
+    def low(self) -> float:
+        """End of the interval."""
+        return self.mean - self.half
+
+    @property
+    def high(self) -> float:
+        """The other end."""
+        return self.mean + self.half
+
     def to_text(self, digits: int) -> str:
-        """`mean (low to high)`, the mean alone for one seed."""
-        if self.seeds < 2:
-            return f"{self.mean:,.{digits}f}"
-        return f"{self.mean:,.{digits}f} ({self.low:,.{digits}f} to {self.high:,.{digits}f})"
+        """`mean ± half`, the mean alone for one seed."""
+        mean = f"{self.mean:,.{digits}f}"
+        return mean if self.seeds < 2 else f"{mean} ± {self.half:,.{digits}f}"
 
 
 @dataclass(frozen=True)
@@ -60,12 +67,13 @@ def take_interval(values: Sequence[float]) -> Interval | None:
     """Of a figure's values, one a seed; None without any."""
     if not len(values):
         return None
+    from scipy.stats import t as student_t
+
     mean, count = float(np.mean(values)), len(values)
     if count < 2:
-        return Interval(mean, mean, mean, 1)
-    quantile = _QUANTILES[count - 2] if count <= len(_QUANTILES) + 1 else 1.96
-    half = quantile * float(np.std(values, ddof=1)) / math.sqrt(count)
-    return Interval(mean, mean - half, mean + half, count)
+        return Interval(mean, 0.0, 1)
+    half = float(student_t.ppf(0.975, count - 1)) * float(np.std(values, ddof=1)) / math.sqrt(count)
+    return Interval(mean, half, count)
 
 
 def find_figure(run: Mapping[str, Any], figure: str) -> Any:
