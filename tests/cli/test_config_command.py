@@ -35,20 +35,20 @@ def test_it_shows_what_the_same_words_would_run(run: Run, method: str) -> None:
 
 
 def test_a_value_comes_from_the_last_that_sets_it(run: Run) -> None:
-    shown = fields(run, "env=overcooked/forced_coordination", "phase1.model_updates=30", "agent.lam=0.95")
+    shown = fields(run, "phase1.model_updates=30", "agent.lam=0.95")
     assert {
         name: shown[name]["source"]
         for name in ("agent.units", "phase1.max_steps", "agent.entropy", "phase1.model_updates", "agent.lam")
     } == {
         "agent.units": "schema",
-        "phase1.max_steps": "recipe laptop",
-        "agent.entropy": "layout row of laptop",
+        "phase1.max_steps": "layout row of laptop",
+        "agent.entropy": "recipe laptop",
         "phase1.model_updates": "command line",
         "agent.lam": "command line",
     }
     assert (shown["agent.entropy"]["value"], shown["agent.entropy"]["default"]) == (0.04, 0.02)
-    assert "first soup" in shown["agent.entropy"]["reason"] and not shown["agent.entropy"]["ours"]
-    assert shown["env.name"]["source"] == "preset env=overcooked/forced_coordination"
+    assert "first soups" in shown["agent.entropy"]["reason"] and not shown["agent.entropy"]["ours"]
+    assert shown["env.name"]["source"] == "preset env=overcooked/cramped_room"
     assert fields(run, "scale=paper")["phase1.patience"]["ours"]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from popgen.methods.recipe import Recipe, because, ours
 
-_CHANCE = "chance alone must find the first soup (docs/notes/learning.md, Forced coordination)"
+_CHANCE = "chance must find the first soups, and better ways later (docs/notes/learning.md, More chance)"
 _FALSE_DELIVERIES = "imagined deliveries must not outnumber real ones (docs/notes/learning.md, The counter circuit)"
 _DREAMER = "DreamerV3's (Hafner et al. 2025), which the paper builds on; its table has none"
 _NEVER = "never reached: the table's steps are what is run"
@@ -15,10 +15,13 @@ LAPTOP = Recipe(
     {
         "phase1.prefill_steps": 400_000,
         "phase1.max_steps": 1_600_000,
-        "phase1.target_score": 10.0,
-        "phase1.model_updates": 25,
-        "agent.entropy": 0.02,
+        "phase1.target_score": because(10.0, "half of it tells that self-play has begun"),
+        "phase1.plateau": because(10, "member 1 learns until it gains no more; self-play is what populations are for"),
+        "phase1.model_updates": because(40, "the model learns more from the few soups that there are"),
+        "agent.entropy": because(0.04, _CHANCE),
         "phase2.max_rounds": because(16, "a member that is still weak after eight rounds gets some more"),
+        "phase2.plateau": because(2, "so does one that still improves"),
+        "phase2.model_lag": because(1, "the second core works (docs/notes/learning.md, A model that lags)"),
     },
     {
         "overcooked/cramped_room": {
@@ -26,10 +29,6 @@ LAPTOP = Recipe(
             "phase1.max_steps": 680_000,
             "phase1.target_score": 10.5,
             "phase2.max_rounds": 9,
-        },
-        "overcooked/forced_coordination": {
-            "agent.entropy": because(0.04, _CHANCE),
-            "phase1.model_updates": because(40, "the model learns more from the few soups that there are"),
         },
         "overcooked/counter_circuit_o_1order": {
             "world_model.batch": because(32, "more and smaller updates know the kitchen sooner"),
@@ -64,8 +63,11 @@ DEMO = Recipe(
         "population.size": 2,
         "evaluation.episodes": 10,
         "phase1.target_score": because(9.0, "plays well enough to watch"),
+        "phase1.plateau": because(0, "stops there"),
         "phase2.rounds": 4,
         "phase2.max_rounds": 5,
+        "phase2.plateau": 0,
+        "phase2.model_lag": because(0, "four rounds are too few to lose one"),
         "phase2.target_score": 5.0,
     },
     {"overcooked/cramped_room": {"phase1.max_steps": 600_000}},
