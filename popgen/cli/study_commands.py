@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from popgen.cli import study_check_command
 from popgen.cli.arguments import Parser, add_command, at_least, label_and_path
 from popgen.cli.printing import ERROR, OK, print_json
 from popgen.cli.training import bound_threads
@@ -40,6 +41,7 @@ def add(commands: Any) -> None:
     export.add_argument("study", metavar="STUDY")
     export.add_argument("--out", metavar="DIR", default=None, help="STUDY/export by default")
     export.add_argument("--format", choices=("parquet", "csv"), default="parquet", help="of the steps (%(default)s)")
+    study_check_command.add(kinds)
     balance = add_command(
         kinds,
         "balance",
