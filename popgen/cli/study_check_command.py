@@ -19,12 +19,17 @@ def add(kinds: Any) -> None:
         kinds,
         "check-browser",
         check_browser,
-        "prove that the rules in the browser are the simulator's",
+        "prove that rules and egos in the browser do what they do here",
         "Plays all recorded transitions of people, and random ones in every layout and cooking mode, in JavaScript "
         "(Node, or a headless browser) and in the simulator: next states, rewards, ends, events and observations must "
-        "be equal. Ends with code 2 where one is not. Keys of --json: engine, kitchens (layout, cooking, source, "
-        "transitions, differing), transitions, differing.",
+        "be equal. With --ego it plays games of these members instead: actions and probabilities must be those of "
+        "their programs here to the last bit; `network` counts actions that PyTorch's float32 would not take at the "
+        "same random number. Ends with code 2 where something differs. Keys of --json: engine, kitchens (layout, "
+        "cooking, source, transitions, differing), transitions, egos (ego, states, differing, network, furthest), "
+        "differing.",
     )
+    check.add_argument("--ego", metavar="POPULATION[:MEMBER]", action="append", default=[], help="may be repeated")
+    check.add_argument("--states", type=at_least(1), default=10_000, help="of each ego, whole games (%(default)s)")
     check.add_argument("--layout", action="append", metavar="NAME", help="of overcooked_ai; all by default")
     check.add_argument("--transitions", type=at_least(1), default=1_000_000, help="random ones in all (%(default)s)")
     check.add_argument("--no-people", action="store_true", help="leave the recorded transitions out")
@@ -40,18 +45,31 @@ def check_browser(args: argparse.Namespace) -> int:
     from popgen.study.script_engine import open_engine
 
     with open_engine(args.engine) as engine:
-        rows = [{"source": source, **asdict(found)} for source, found in _check_rules(engine, args)]
-    transitions, differing = (sum(row[key] for row in rows) for key in ("transitions", "differing"))
+        egos = [{"ego": name, **asdict(_check_member(engine, name, args))} for name in args.ego]
+        checked = [] if egos else _check_rules(engine, args)
+        rows = [{"source": source, **asdict(found)} for source, found in checked]
+    transitions = sum(row["transitions"] for row in rows)
+    differing = sum(row["differing"] for row in (*rows, *egos))
     if args.json:
-        print_json({"engine": engine.name, "kitchens": rows, "transitions": transitions, "differing": differing})
+        told = {"engine": engine.name, "kitchens": rows, "transitions": transitions, "egos": egos}
+        print_json({**told, "differing": differing})
     else:
-        for row in rows:
-            if row["differing"]:
-                print(f"{row['layout']}, {row['cooking']}, {row['source']}: {row['differing']:,} transitions differ")
+        _print_kitchens(engine.name, rows)
+        for one in egos:
+            beside = "" if one["network"] is None else f", {one['network']} from the network's in float32"
+            print(f"{one['ego']}: {one['states']:,} states, {one['differing']} differ{beside}")
+    return ERROR if differing else OK
+
+
+def _print_kitchens(engine: str, rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        if row["differing"]:
+            print(f"{row['layout']}, {row['cooking']}, {row['source']}: {row['differing']:,} transitions differ")
+    if rows:
         counted = {source: sum(row["transitions"] for row in rows if row["source"] == source) for source in _SOURCES}
         told = ", ".join(f"{count:,} {source}" for source, count in counted.items())
-        print(f"{engine.name}: {len(rows)} kitchens, transitions: {told}; {differing:,} differ")
-    return ERROR if differing else OK
+        differing = sum(row["differing"] for row in rows)
+        print(f"{engine}: {len(rows)} kitchens, transitions: {told}; {differing:,} differ")
 
 
 _SOURCES = ("random", PEOPLE)
@@ -75,3 +93,22 @@ def _check_rules(engine: Any, args: argparse.Namespace) -> Any:
     if known and not args.no_people:
         for env, played in list_recorded(load_games(layouts=known)):
             yield PEOPLE, check_transitions(engine, env, played)
+
+
+def _check_member(engine: Any, name: str, args: argparse.Namespace) -> Any:
+    """An ego in whole games."""
+    from popgen.errors import UserError
+    from popgen.population import load_population
+    from popgen.study.browser_check import check_ego
+    from popgen.study.study_definition import check_kitchen
+
+    path, colon, member = name.rpartition(":")
+    path, number = (path, int(member)) if colon and member.isdecimal() else (name, 1)
+    population = load_population(path)
+    env = check_kitchen(population)
+    if not 1 <= number <= len(population):
+        raise UserError("--ego", f"{path} has no member {number}", f"it has {len(population)}")
+    try:
+        return check_ego(engine, env, population[number], -(-args.states // env.horizon), args.seed)
+    except ValueError as error:
+        raise UserError("--ego", f"{name}: {error}", "leave it out") from None

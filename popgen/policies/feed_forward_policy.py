@@ -13,6 +13,7 @@ from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.nets.blocks import draw_by_multinomial
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.nets.weights import load_weights, weights_of
+from popgen.policies.portable_program import Program, ProgramWriter
 from popgen.types import check, check_reset
 
 
@@ -115,6 +116,16 @@ class FeedForwardPolicy:
     def seat_network(self) -> nn.Module | None:
         """See `popgen.play.stacked_partners.Stackable`; a greedy policy draws no actions."""
         return None if self.greedy else FeedForwardSeat(self.net, self._players)
+
+    def to_program(self) -> Program:
+        """See `popgen.policies.portable_program.Portable`."""
+        if self.view != "features":
+            raise ValueError(f"it reads the view {self.view!r}, programs read 'features'")
+        writer = ProgramWriter()
+        return writer.finish(self._write_logits(writer), greedy=self.greedy)
+
+    def _write_logits(self, writer: ProgramWriter) -> str:
+        return writer.add_layers(self.net, writer.add_operation("join", ("obs", "seat")))
 
     def config(self) -> dict[str, Any]:
         """Sizes, the view's name and the way to pick an action."""

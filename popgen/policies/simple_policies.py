@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from popgen.envs.contract import EnvSpec
+from popgen.policies.portable_program import Program, write_constant
 from popgen.types import check_reset
 
 
@@ -61,6 +62,12 @@ class RandomPolicy:
         """Draw on from `memory()`."""
         self._rng.bit_generator.state, self._batch = memory["generator"], memory["batch"]
 
+    def to_program(self) -> Program:
+        """See `popgen.policies.portable_program.Portable`."""
+        shares = np.array(self.probabilities or [1.0] * self.num_actions)
+        with np.errstate(divide="ignore"):
+            return write_constant(np.log(shares).tolist())
+
     def config(self) -> dict[str, Any]:
         """The action probabilities, None for uniform."""
         return {"probabilities": self.probabilities}
@@ -90,7 +97,7 @@ class IdlePolicy:
             raise ValueError(f"no action {action!r} among {', '.join(action_names)}")
         self.view = "features"
         self.action = action
-        self._index = list(action_names).index(action)
+        self._index, self._num_actions = list(action_names).index(action), len(action_names)
         self._batch: int | None = None
 
     def reset(self, batch: int, seed: int) -> None:
@@ -101,6 +108,10 @@ class IdlePolicy:
         """(B, P) times the same action."""
         check_reset(self._batch, len(obs))
         return np.full(obs.shape[:2], self._index, np.uint8)
+
+    def to_program(self) -> Program:
+        """See `popgen.policies.portable_program.Portable`."""
+        return write_constant([0.0 if action == self._index else -np.inf for action in range(self._num_actions)])
 
     def config(self) -> dict[str, Any]:
         """The name of the action."""

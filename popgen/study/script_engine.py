@@ -21,7 +21,7 @@ from typing import Any
 
 from popgen.errors import UserError
 
-SCRIPTS = ("kitchen_rules.js", "task_runner.js")
+SCRIPTS = ("kitchen_rules.js", "ego_network.js", "task_runner.js")
 """What a task needs, of popgen/study/assets."""
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

@@ -1,18 +1,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from popgen.cli import main
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.envs.overcooked import kernels as k
 from popgen.errors import UserError
+from popgen.methods.ego.ego_networks import EgoSizes
+from popgen.methods.ego.ego_policy import EgoPolicy, HierarchicalEgoPolicy
+from popgen.methods.registry import recipe
+from popgen.methods.xpm_sim.encoded_policy import EncodedPolicy
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
+from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.program_runner import ProgramRunner
 from popgen.study import browser_check
-from popgen.study.browser_check import check_transitions, draw_transitions, open_kitchens
+from popgen.study.browser_check import check_ego, check_transitions, draw_transitions, open_kitchens
 from popgen.study.script_engine import ScriptEngine, find_engine, open_engine
 
 needs_engine = pytest.mark.skipif(find_engine() is None, reason="needs Node or Chromium")
@@ -69,3 +78,48 @@ def test_the_command_counts(capsys: pytest.CaptureFixture[str]) -> None:
 def test_an_engine_that_is_none_is_named() -> None:
     with open_engine("/bin/false") as broken, pytest.raises(UserError, match="false: gave no answer"):
         broken.run_task("transitions", {})
+
+
+ENV = OvercookedEnv("coordination_ring", 1, horizon=50)
+
+
+def make_world_model() -> Any:
+    config: Any = recipe("xpm_wm", "overcooked/coordination_ring", "smoke")
+    return WorldModelPolicy(config.world_model, config.agent, ENV.spec)
+
+
+FAMILIES: dict[str, Callable[[], Any]] = {
+    "feed_forward": lambda: FeedForwardPolicy(ENV.spec.views["features"], 6, units=16),
+    "encoded": lambda: EncodedPolicy(
+        ENV.spec.views["features"], 6, latent=8, encoder_units=16, encoder_layers=1, units=16
+    ),
+    "ego": lambda: EgoPolicy(EgoSizes(units=16), ENV.spec),
+    "hierarchical_ego": lambda: HierarchicalEgoPolicy(
+        EgoSizes(units=16, skills=3), ENV.spec, duration_least=3, duration_most=6
+    ),
+    "world_model": make_world_model,
+}
+
+
+def sharpen_weights(policy: Any) -> None:
+    """So that actions are far from equally likely."""
+    generator = torch.Generator().manual_seed(0)
+    net = policy._parts if hasattr(policy, "_parts") else policy.net
+    for parameter in net.parameters():
+        parameter.data.add_(0.2 * torch.randn(parameter.shape, generator=generator))
+
+
+@needs_engine
+@pytest.mark.parametrize("family", FAMILIES)
+def test_egos_act_in_the_browser_as_here(engine: ScriptEngine, family: str) -> None:
+    policy = FAMILIES[family]()
+    sharpen_weights(policy)
+    found = check_ego(engine, ENV, policy, 2, 0)
+    assert (found.states, found.differing, found.network) == (100, 0, 0) and found.furthest < 1e-5
+
+
+@needs_engine
+def test_another_ego_is_found(engine: ScriptEngine, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, other = (FeedForwardPolicy(ENV.spec.views["features"], 6, units=16, seed=seed) for seed in (0, 1))
+    monkeypatch.setattr(browser_check, "ProgramRunner", lambda *_: ProgramRunner(other.to_program(), 6))
+    assert check_ego(engine, ENV, policy, 1, 0).differing == 50

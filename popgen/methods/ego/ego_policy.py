@@ -14,7 +14,10 @@ from popgen.methods.ego.ego_networks import EgoSizes, build_network
 from popgen.methods.ego.two_levels import draw_durations
 from popgen.nets.blocks import draw_by_gumbel
 from popgen.nets.weights import Weights, load_weights, weights_of
+from popgen.policies.portable_program import Program, ProgramWriter
 from popgen.types import check, check_reset
+
+_GRU_PARTS = ("weight_ih", "bias_ih", "weight_hh", "bias_hh")
 
 
 class EgoPolicy:
@@ -55,6 +58,16 @@ class EgoPolicy:
         drawn = draw_by_gumbel(logits, self._generator).action
         return drawn.numpy().astype(np.uint8).reshape(len(obs), self._players)
 
+    @torch.no_grad()
+    def tell_probabilities(
+        self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray, skill: int | None
+    ) -> np.ndarray:
+        """Take in a step as `act` does; of each seat's actions, (B, P, A), under one z where there are two levels."""
+        first = torch.from_numpy(np.repeat(np.asarray(is_first, bool), self._players))
+        memory = self._encode_view(obs, previous_actions, first)
+        chosen = None if skill is None else torch.full((len(memory),), skill)
+        return self.net.action_logits(memory, chosen).softmax(-1).numpy().reshape(*obs.shape[:2], -1)
+
     def _encode_view(self, obs: np.ndarray, previous_actions: np.ndarray, first: Tensor) -> Tensor:
         """Take in a step; what the memory gives, (B * P, U)."""
         seats = torch.arange(self._players).repeat(len(obs))
@@ -76,6 +89,28 @@ class EgoPolicy:
         """Continue from `memory()`."""
         self._state = torch.from_numpy(np.array(memory["state"], np.float32))
         self._generator.set_state(torch.from_numpy(np.array(memory["generator"])))
+
+    def to_program(self) -> Program:
+        """See `popgen.policies.portable_program.Portable`."""
+        net, writer = self.net, ProgramWriter()
+        if not isinstance(net.memory, torch.nn.GRU):
+            raise ValueError(f"its network {self._sizes.network!r} has no program, only features_gru has")
+        state = writer.add_memory("state", net.state_size)
+        leak = torch.nn.LeakyReLU()
+        rows = writer.add_operation("join", ("obs", "seat", "own", "other"))
+        encoded = writer.add_layers((net.first, leak, net.second, leak), rows)
+        weights = {name: net.memory.get_parameter(f"{name}_l0") for name in _GRU_PARTS}
+        gates = (
+            writer.add_linear(encoded, weights["weight_ih"], weights["bias_ih"]),
+            writer.add_linear(state, weights["weight_hh"], weights["bias_hh"]),
+        )
+        writer.add_operation("gru", gates, into=state)
+        hidden = self._write_hidden(writer, state)
+        return writer.finish(writer.add_layers((leak, net.action), hidden))
+
+    def _write_hidden(self, writer: ProgramWriter, state: str) -> str:
+        """The actor's hidden layer before its activation."""
+        return writer.add_linear(state, self.net.hidden.weight, self.net.hidden.bias + self.net.skill_bias[0])
 
     def config(self) -> dict[str, Any]:
         """The networks' sizes."""
@@ -141,6 +176,13 @@ class HierarchicalEgoPolicy(EgoPolicy):
         super().load_memory(memory)
         self._skill = torch.from_numpy(np.array(memory["skill"], np.int64))
         self._left = torch.from_numpy(np.array(memory["left"], np.int64))
+
+    def _write_hidden(self, writer: ProgramWriter, state: str) -> str:
+        assert self.net.skill is not None
+        chosen = writer.add_layers([self.net.skill], state)
+        skill = writer.add_operation("hold", chosen, least=self._least, most=self._most)
+        parts = (writer.add_layers([self.net.hidden], state), writer.add_linear(skill, self.net.skill_bias.T))
+        return writer.add_operation("add", parts)
 
     def config(self) -> dict[str, Any]:
         """The networks' sizes and the durations."""

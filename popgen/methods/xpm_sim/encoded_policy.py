@@ -11,6 +11,7 @@ from popgen.envs.contract import ViewSpec
 from popgen.methods.xpm_sim.vae import latent_view
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.policies.portable_program import ProgramWriter
 
 
 class EncodedNet(nn.Module):
@@ -59,6 +60,13 @@ class EncodedPolicy(FeedForwardPolicy):
             torch.manual_seed(seed)
             encoder = FeedForwardNet(view, 2 * self.latent, 0, sizes)
             self.net = EncodedNet(encoder, self.latent, num_actions, num_players, self.sizes)
+
+    def _write_logits(self, writer: ProgramWriter) -> str:
+        *hidden, last = self.net.encoder
+        assert isinstance(last, nn.Linear)
+        inner = writer.add_layers(hidden, "obs")
+        latent = writer.add_linear(inner, last.weight[: self.latent], last.bias[: self.latent])
+        return writer.add_layers(self.net.head, writer.add_operation("join", (latent, "seat")))
 
     def config(self) -> dict[str, Any]:
         """Sizes of head and encoder, and the way to pick an action."""

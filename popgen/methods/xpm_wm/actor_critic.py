@@ -19,6 +19,7 @@ from popgen.methods.xpm_wm.latent_filter import Latent, player_masks
 from popgen.methods.xpm_wm.world_model import LatentFilter
 from popgen.nets import weights as w
 from popgen.nets.blocks import TwoHot, draw_by_inversion, mlp
+from popgen.policies.portable_program import Program, ProgramWriter
 from popgen.types import check_reset
 
 
@@ -65,6 +66,12 @@ class Actor(nn.Module):
     def sample(self, latent: Latent, seat: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """(...,) int64 actions."""
         return draw_by_inversion(self.log_probs(latent, seat), generator)
+
+    def write_program(self, writer: ProgramWriter, h: str, z: str) -> Program:
+        """The end of a program, from the vectors of the latent."""
+        own = writer.add_operation("times", (z, writer.add_linear("seat", self.masks.T)))
+        inputs = writer.add_operation("join", ([h] if self.use_h else []) + [own, "seat"])
+        return writer.finish(writer.add_layers(self.net, inputs), unimix=self.config.unimix)
 
 
 class Critic(nn.Module):
@@ -178,6 +185,16 @@ class WorldModelPolicy:
     def seat_network(self) -> nn.Module | None:
         """See `popgen.play.stacked_partners.Stackable`; a filter that samples draws from a generator of its own."""
         return WorldModelSeat(self.filter, self.actor) if self._model.imagination == "mode" else None
+
+    def to_program(self) -> Program:
+        """See `popgen.policies.portable_program.Portable`."""
+        if self.view != "features":
+            raise ValueError(f"it reads the view {self.view!r}, programs read 'features'")
+        if self._model.imagination != "mode":
+            raise ValueError("its latents are drawn (imagination=sample), programs take the likeliest")
+        writer = ProgramWriter()
+        latent = self.filter.write_program(writer)
+        return self.actor.write_program(writer, *latent)
 
     def memory(self) -> dict[str, Any]:
         """The running episodes' latents and the generator; see `popgen.play.policy.Remembering`."""

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.methods.xpm_wm.config import WorldModelConfig
 from popgen.nets.blocks import ConvEncoder, NormGRUCell, mlp
+from popgen.policies.portable_program import ProgramWriter
 from popgen.types import check
 
 
@@ -223,6 +224,19 @@ class LatentFilter(nn.Module):
         h = self.transition(*self.before(latent, actions, is_first))
         probs = self.posterior(h, self.encoder(self.scaled(obs)))
         return Latent(h, self.drawn(probs, generator))
+
+    def write_program(self, writer: ProgramWriter) -> tuple[str, str]:
+        """One step of acting on flat views of 0 and 1; the names of h and z."""
+        h, z = writer.add_memory("h", self.config.deter), writer.add_memory("z", self.latent_size)
+        inputs = writer.add_operation("join", (z, "joint"))
+        if self.step_net is not None:
+            inputs = writer.add_layers(self.step_net, writer.add_operation("join", (inputs, h)))
+        joined = writer.add_operation("join", (inputs, h))
+        writer.add_operation("norm_gru", writer.add_layers((self.gru.gates, self.gru.norm), joined), into=h)
+        embedding = writer.add_layers(self.encoder.trunk, "both")
+        logits = writer.add_layers(self.posterior_net, writer.add_operation("join", (h, embedding)))
+        writer.add_operation("modes", logits, into=z, classes=self.config.classes)
+        return h, z
 
     def drawn(
         self, probs: Float[Tensor, "*batch C G"], generator: torch.Generator | None = None

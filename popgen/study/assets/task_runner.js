@@ -1,4 +1,5 @@
 // Works on what popgen/study/script_engine.py asks, in a browser or in Node: fetches a task, answers, fetches the next.
+import { Partner } from "./ego_network.js";
 import { Kitchen } from "./kitchen_rules.js";
 
 // Rows of a state and two actions -> rows of the next state, reward (4 bytes), score, truncated, events of both
@@ -28,7 +29,32 @@ function playTransitions(told, bytes) {
   return out;
 }
 
-const tasks = { transitions: playTransitions };
+// Games of a partner with recorded actions of a person, one byte a step, before the partner's file -> its action and
+// its probabilities (float64) at each step.
+function playPartner(told, bytes) {
+  const kitchen = new Kitchen(told.kitchen);
+  const steps = told.games * told.steps;
+  const partner = new Partner(bytes.slice(steps).buffer, told.kitchen.actions.length, kitchen.features);
+  const width = 1 + 8 * told.kitchen.actions.length;
+  const out = new Uint8Array(steps * width);
+  for (let game = 0; game < told.games; game++) {
+    const state = kitchen.start.slice();
+    const seat = game % 2;
+    let previous = null;
+    partner.begin(seat, told.generators[game]);
+    for (let step = 0; step < told.steps; step++) {
+      const row = game * told.steps + step;
+      const action = partner.act(kitchen.encode(state), previous);
+      previous = seat ? [bytes[row], action] : [action, bytes[row]];
+      out[row * width] = action;
+      out.set(new Uint8Array(partner.probabilities.slice().buffer), row * width + 1);
+      kitchen.step(state, previous);
+    }
+  }
+  return out;
+}
+
+const tasks = { transitions: playTransitions, partner: playPartner };
 
 // A task is the length of its JSON (4 bytes), the JSON, and bytes.
 export async function workOn(address) {
