@@ -69,6 +69,7 @@ def _add_init(kinds: Any) -> None:
     init.add_argument("study", metavar="STUDY")
     init.add_argument("--ego", metavar="NAME=POPULATION[:MEMBER]", type=label_and_path, action="append", required=True)
     init.add_argument("--tutorial", metavar="POPULATION[:MEMBER]", required=True, help="partner of the tutorials")
+    init.add_argument("--host", choices=("browser", "server"), default="browser", help="where games run (%(default)s)")
     init.add_argument("--tutorials", type=at_least(0), default=3, help="practice games (%(default)s)")
     init.add_argument("--pairs", type=at_least(1), default=2, help="of games in each layout (%(default)s)")
     init.add_argument("--steps", type=at_least(1), default=400, help="of a game (%(default)s)")
@@ -118,7 +119,7 @@ def init_study(args: argparse.Namespace) -> int:
     from popgen.study.study_folder import make_study
 
     egos = [_read_member(name, path) for name, path in args.ego]
-    settings = {"tutorials": args.tutorials, "pairs": args.pairs, "steps": args.steps}
+    settings = {"host": args.host, "tutorials": args.tutorials, "pairs": args.pairs, "steps": args.steps}
     study = make_study(Path(args.study), egos, _read_member("tutorial", args.tutorial), settings)
     definition = study.definition
     games = definition.tutorials + 2 * definition.pairs * len(definition.layouts)

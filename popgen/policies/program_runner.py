@@ -22,9 +22,15 @@ class ProgramRunner:
         program: see `portable_program`.
         num_actions: A.
 
+    Attributes:
+        view: name of the view that programs read.
+        probabilities: (A,) of the last step.
+
     Raises:
         ValueError: an operation that is not known.
     """
+
+    view = "features"
 
     def __init__(self, program: Program, num_actions: int) -> None:
         self.probabilities = np.zeros(num_actions)

@@ -1,8 +1,8 @@
-"""Where games run: behind `GameHost`, today in the server.
+"""Where games run: behind `GameHost`, in the server or in the browser (`browser_host`).
 
 `ServerGameHost` steps every game at fixed times of a monotonic clock (150 ms apart, no drift) in one thread beside the
 event loop, the earliest one first; a second thread writes what was played, half a second's steps at a time, so that a
-killed server loses less than a second. A host whose rules run in the browser would hand over recordings instead.
+killed server loses less than a second.
 """
 
 from __future__ import annotations
@@ -17,16 +17,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from sqlalchemy.exc import OperationalError
 
 from popgen.pages.live_game import KEYS, Keyboard
-from popgen.play.policy import Policy
 from popgen.study.game_records import FINISHED, VOID, GameEnd, GameRecords, GameTicket, Tick
 from popgen.study.hosted_game import HostedGame, PartnerShelf
+from popgen.study.record_writer import RecordWriter
 from popgen.study.study_messages import GameMessage
-
-FLUSH_SECONDS = 0.4
-"""Steps wait so long at most until they are written."""
 
 LATE_LIMIT = 1.0
 """Periods by which a step may be late before all later ones move, so that none is hurried."""
@@ -80,8 +76,8 @@ class _RunningGame:
 
     def __init__(self, ticket: GameTicket, place: int, tell: Tell, shelf: PartnerShelf, pictures: bool) -> None:
         self.ticket, self.place, self.tell, self.shelf = ticket, place, tell, shelf
-        self.policy: Policy = shelf.take()
-        self.game = HostedGame(shelf.env, self.policy, ticket.seat, ticket.seed)
+        self.partner = shelf.take()
+        self.game = HostedGame(shelf.env, self.partner, ticket.seat, ticket.seed)
         names = shelf.env.spec.action_names
         self.keyboard = Keyboard(names.index("stay"))
         self.codes = {KEYS[name]: number for number, name in enumerate(names) if name in KEYS}
@@ -152,7 +148,7 @@ class ServerGameHost:
     ) -> None:
         self.pace, self.clock = pace, clock
         self._shelves = shelves
-        self._writer = _RecordWriter(records)
+        self._writer = RecordWriter(records)
         self._games: dict[int, _RunningGame] = {}
         self._due: list[tuple[float, int]] = []
         self._wake = threading.Condition()
@@ -204,7 +200,7 @@ class ServerGameHost:
         with one.busy:  # a step that is being played is played to its end
             one.running, one.over = False, True
         self._writer.flush()
-        one.shelf.give_back(one.policy)
+        one.shelf.give_back(one.partner)
 
     def stop(self) -> None:
         """End both threads; everything that was played is recorded."""
@@ -284,71 +280,3 @@ class ServerGameHost:
         end = GameEnd(one.ticket.id, one.ticket.participant, one.place, status, one.game.score)
         told = {"over": status, "score": round(one.game.score, 4)}
         self._writer.put(end, lambda: one.tell(told))
-
-
-class _RecordWriter:
-    """Writes what games put, in their order, in a thread of its own.
-
-    Args:
-        records: where it is written.
-    """
-
-    def __init__(self, records: GameRecords) -> None:
-        self._records = records
-        self._rows: list[Tick | GameEnd] = []
-        self._after: list[Callable[[], None]] = []
-        self._ready = threading.Condition()
-        self._hurry = self._stopping = False
-        self._thread = threading.Thread(target=self._run_writer, name="popgen-records", daemon=True)
-        self._thread.start()
-
-    def put(self, row: Tick | GameEnd, after: Callable[[], None] | None = None) -> None:
-        """Write soon; `after` is called once it is written. An end is written at once, with all before it."""
-        with self._ready:
-            self._rows.append(row)
-            if after is not None:
-                self._after.append(after)
-                self._hurry = True
-            self._ready.notify()
-
-    def flush(self) -> None:
-        """Return when everything put so far is written."""
-        written = threading.Event()
-        with self._ready:
-            self._after.append(written.set)
-            self._hurry = True
-            self._ready.notify()
-        written.wait()
-
-    def stop(self) -> None:
-        """Write all and end."""
-        with self._ready:
-            self._stopping = self._hurry = True
-            self._ready.notify()
-        self._thread.join()
-
-    def _run_writer(self) -> None:
-        while True:
-            with self._ready:
-                while not (self._rows or self._after or self._stopping):
-                    self._ready.wait()
-                self._ready.wait_for(lambda: self._hurry, FLUSH_SECONDS)
-                rows, after, ended = self._rows, self._after, self._stopping
-                self._rows, self._after, self._hurry = [], [], self._stopping
-            self._write_rows(rows)
-            for call in after:
-                call()
-            if ended:
-                return
-
-    def _write_rows(self, rows: list[Tick | GameEnd]) -> None:
-        """A full disk is waited for; nothing is given up."""
-        while rows:
-            try:
-                self._records.write(rows)
-                return
-            except OperationalError as error:
-                _log.error("records cannot be written (%s); trying again", error.orig)
-                time.sleep(FLUSH_SECONDS)
-                if self._stopping:
-                    return

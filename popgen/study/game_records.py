@@ -15,6 +15,8 @@ from popgen.study.participant_records import ACTIVE, INACTIVE, Participant, Part
 from popgen.study.study_tables import games, participants, ticks
 
 OPEN, FINISHED, VOID = "open", "finished", "void"
+PartnerKey = tuple[str, str | None]
+"""Layout and ego; the tutorial's is None."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,19 @@ class GameRecords:
                 assert key is not None
                 found = connection.execute(sa.select(games).where(games.c.id == key[0])).one()
             return OpenedGame(read_ticket(connection, found), row.station)
+
+    def find_open(self, who: Participant) -> PartnerKey:
+        """The partner of the game that a participant plays at present.
+
+        Raises:
+            Refused: there is none.
+        """
+        chosen = sa.select(games.c.layout, games.c.ego).where(games.c.participant == who.id, games.c.status == OPEN)
+        with self.people.database.read() as connection:
+            row = connection.execute(chosen.order_by(games.c.id.desc())).first()
+        if row is None:
+            raise Refused("elsewhere")
+        return row.layout, row.ego
 
     def _plan_game(self, number: int, slot: int | None) -> dict[str, Any]:
         pair, position = divmod(number - self.definition.tutorials, 2)

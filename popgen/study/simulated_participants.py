@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +25,16 @@ from popgen.envs.overcooked import OvercookedEnv
 from popgen.errors import UserError
 from popgen.pages.live_game import KEYS
 from popgen.play.policy import Policy
+from popgen.policies.portable_program import read_program
+from popgen.policies.program_runner import ProgramRunner
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.population.store import Population
-from popgen.study.hosted_game import open_shelves
+from popgen.study.hosted_game import HostedGame, open_shelves
 from popgen.study.study_definition import Study, check_kitchen, find_layout
+from popgen.study.study_messages import MOST_STEPS
+
+SIMULATED_AHEAD = 40
+"""Steps that a simulated participant plays before they are recorded, where no time is kept."""
 
 RETRY_SECONDS = 0.3
 MOST_RETRIES = 400
@@ -155,6 +162,10 @@ class SimulatedParticipant:
     async def _call(self, name: str, body: Any = None) -> dict[str, Any]:
         return await asyncio.to_thread(self._send_request, name, body)
 
+    def _fetch(self, name: str) -> bytes:
+        with self._opener.open(f"http://{self._address}/api/{name}", timeout=60) as answer:
+            return answer.read()
+
     def _send_request(self, name: str, body: Any) -> dict[str, Any]:
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(
@@ -177,6 +188,10 @@ class SimulatedParticipant:
         begun = json.loads(await line.recv())
         facts, step = begun["begin"], begun["step"]
         self._note_break(facts["number"], step)
+        if facts.get("host") == "browser":
+            await self._play_here(line, facts)
+            self.visit.games += 1
+            return
         env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
         policy.reset(1, int(self._rng.integers(2**31)))
         previous, first = np.zeros((1, 2), np.uint8), True
@@ -194,6 +209,17 @@ class SimulatedParticipant:
             self.visit.steps += "state" in told
         self.visit.games += 1
 
+    async def _play_here(self, line: Any, facts: Mapping[str, Any]) -> None:
+        """A game whose rules and partner run on this side, as in a browser; in real time where the study has any."""
+        env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
+        program = read_program(await asyncio.to_thread(self._fetch, "partner"))
+        game = HostedGame(env, ProgramRunner(program, env.spec.num_actions), facts["seat"], facts["seed"])
+        if game.repeat(np.array(facts["actions"], np.uint8).reshape(-1, 2)) is not None:
+            raise UserError(self._address, "sent a game that its partner does not play so", "report it")
+        policy.reset(1, int(self._rng.integers(2**31)))
+        played = PlayedHere(line, game, policy, facts, self.visit)
+        await played.play_on()
+
     def _load_policy(self, layout: str) -> Policy:
         if layout not in self._policies:
             self._policies[layout] = self._casting.draw(layout, self._rng)
@@ -203,6 +229,70 @@ class SimulatedParticipant:
         """Steps that were shown before and are not recorded."""
         shown = self.visit.shown.get(number, 0) if step else self.visit.shown.pop(number, 0)
         self.visit.lost = max(self.visit.lost, shown - step)
+
+
+class PlayedHere:
+    """A game that a simulated participant plays by itself and sends step by step.
+
+    Args:
+        line: to the server.
+        game: where it stands.
+        policy: of the participant.
+        facts: what the server told of the game.
+        visit: gets what is shown.
+    """
+
+    def __init__(self, line: Any, game: HostedGame, policy: Policy, facts: Mapping[str, Any], visit: Visit) -> None:
+        self._line, self._game, self._policy, self._facts, self._visit = line, game, policy, facts, visit
+        names = game.env.spec.action_names
+        self._codes = {number: KEYS[name] for number, name in enumerate(names) if name in KEYS}
+        self._kept, self._over = game.step, False
+        self._batch: list[list[Any]] = []
+        self._previous = np.zeros((1, 2), np.uint8)
+
+    async def play_on(self) -> None:
+        """To the end, never more than a second's steps ahead of what is recorded."""
+        first, period = self._game.step, self._facts["step_ms"] / 1000
+        began = time.monotonic()
+        size = 2 if period else MOST_STEPS
+        ahead = max(size, int(1 / period)) if period else SIMULATED_AHEAD
+        await self._line.send(json.dumps({"go": True}))
+        while not self._over and self._game.step < self._facts["steps"]:
+            due = began + (self._game.step - first + 1) * period
+            if period:
+                await asyncio.sleep(max(0.0, due - time.monotonic()))
+            self._play_step(max(0.0, time.monotonic() - due) if period else 0.0, self._game.step == first, began)
+            if len(self._batch) >= size:
+                await self._send_batch()
+            while self._game.step - self._kept > ahead and not self._over:
+                await self._hear()
+        await self._send_batch()
+        while not self._over:
+            await self._hear()
+
+    def _play_step(self, late: float, first: bool, began: float) -> None:
+        game, seat = self._game, self._facts["seat"]
+        obs = game.env.encode(game.state[None], self._policy.view)
+        chosen = np.array(self._policy.act(obs, self._previous, np.array([first])), np.uint8)
+        played = game.advance(int(chosen[0, seat]))
+        self._previous = np.array([played.actions], np.uint8)
+        code = self._codes.get(played.actions[seat])
+        keys = [[code, 1, 0], [code, 0, 0]] if code else []
+        since = self._facts["elapsed_ms"] + int((time.monotonic() - began) * 1000)
+        row = [game.step - 1, played.state.tobytes().hex(), *played.actions, since, int(late * 1e6), keys]
+        self._batch.append(row)
+        self._visit.steps += 1
+        self._visit.shown[self._facts["number"]] = game.step
+
+    async def _send_batch(self) -> None:
+        if self._batch:
+            await self._line.send(json.dumps({"steps": self._batch}, separators=(",", ":")))
+            self._batch = []
+
+    async def _hear(self) -> None:
+        told = json.loads(await self._line.recv())
+        self._kept = told.get("kept", self._kept)
+        self._over = self._over or "over" in told
 
 
 def press_key(code: str | None, step: int) -> dict[str, Any]:

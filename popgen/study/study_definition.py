@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError, model_validator
 from popgen.durable_files import read_regular
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.errors import UserError
+from popgen.policies.portable_program import Program, write_program
 from popgen.population import load_population
 from popgen.population.manifest import Record, Sha256
 from popgen.population.store import Population
@@ -72,6 +73,7 @@ class StudyDefinition(Record):
     Attributes:
         format, format_version: must be this library's.
         title: of the page.
+        host: where games run, in the server or in the browser.
         consent_version: of the text in consent.md.
         layouts: names, in the order of the design.
         egos: name (blinded) -> layout -> the member; every ego has one in each layout.
@@ -92,6 +94,7 @@ class StudyDefinition(Record):
     format: Literal["popgen-study"] = "popgen-study"
     format_version: Literal[1] = 1
     title: Line = "A study on human-AI collaboration"
+    host: Literal["server", "browser"] = "server"
     consent_version: Line = "1"
     layouts: Annotated[tuple[Name, ...], Field(min_length=1, max_length=20)]
     egos: dict[Name, dict[Name, Ego]]
@@ -183,6 +186,19 @@ def check_kitchen(population: Population) -> OvercookedEnv:
     if not isinstance(env, OvercookedEnv):
         raise UserError("population", f"{population.path} plays {env.spec.name}, not Overcooked", "give another one")
     return env
+
+
+def find_program(population: Population, member: int) -> Program:
+    """A member's program for the browser.
+
+    Raises:
+        UserError: it has none.
+    """
+    try:
+        return write_program(population[member])
+    except ValueError as error:
+        problem = f"is browser, but member {member} of {population.path} cannot play there: {error}"
+        raise UserError("host", problem, "set it to server, or take another member") from None
 
 
 def read_study(folder: str | Path) -> Study:

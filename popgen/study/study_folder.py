@@ -20,6 +20,7 @@ from popgen.study.study_definition import (
     Study,
     StudyDefinition,
     check_kitchen,
+    find_program,
     gather_egos,
     make_ego,
     read_study,
@@ -54,7 +55,8 @@ def make_study(
         settings: further fields of `StudyDefinition`.
 
     Raises:
-        UserError: a population is not there, egos do not fit together, or the folder cannot be written.
+        UserError: a population is not there, egos do not fit together or cannot play where games are to run, or the
+            folder cannot be written.
     """
     if (folder / DEFINITION).exists():
         raise UserError(str(folder), "holds a study already", "choose another folder")
@@ -76,6 +78,9 @@ def make_study(
         definition = StudyDefinition(**values, **(settings or {}))
     except ValidationError as error:
         raise UserError("study", error.errors()[0]["msg"].removeprefix("Value error, "), "see docs/study.md") from None
+    if definition.host == "browser":
+        for one in (*egos, tutorial):
+            find_program(opened[one.population], one.member)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         replace_file(folder / CONSENT, CONSENT_TEXT.encode())

@@ -29,9 +29,10 @@ from starlette.websockets import WebSocketDisconnect
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.pages.page_template import read_asset
 from popgen.study import study_messages as messages
+from popgen.study.browser_host import BrowserGameHost
 from popgen.study.game_host import GameHost, Pace, ServerGameHost
-from popgen.study.game_records import GameRecords, GameTicket
-from popgen.study.hosted_game import find_tutorial_layout, open_shelves
+from popgen.study.game_records import GameRecords, GameTicket, PartnerKey
+from popgen.study.hosted_game import PartnerShelf, find_tutorial_layout, open_shelves
 from popgen.study.participant_path import list_questions
 from popgen.study.participant_records import ACTIVE, Participant, ParticipantRecords, Refused
 from popgen.study.study_definition import Study
@@ -55,6 +56,7 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+_SCRIPTS = ("study_page.js", "study_game.js", "browser_game.js", "kitchen_rules.js", "ego_network.js")
 _log = logging.getLogger("popgen.study")
 B = TypeVar("B", bound=messages.Body)
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -69,6 +71,7 @@ class StudyService:
         study: its definition.
         people, records: its database.
         host: runs the games.
+        shelves: everybody's partners.
         cooking: how pots start, for the instructions.
         accelerated: no limit on how fast a connection's messages come.
     """
@@ -77,6 +80,7 @@ class StudyService:
     people: ParticipantRecords
     records: GameRecords
     host: GameHost
+    shelves: dict[PartnerKey, PartnerShelf]
     cooking: str
     accelerated: bool = False
 
@@ -106,8 +110,11 @@ def open_service(study: Study, *, speed: float = 1.0) -> StudyService:
         end_steps=max(2, round(definition.end_seconds / seconds)),
     )
     envs: list[OvercookedEnv] = [shelf.env for shelf in shelves.values()]
-    host = ServerGameHost(records, shelves, pace)
-    return StudyService(study, people, records, host, envs[0].cooking, speed != 1.0)
+    for shelf in shelves.values():
+        shelf.prepare()
+    kind = BrowserGameHost if definition.host == "browser" else ServerGameHost
+    host = kind(records, shelves, pace)
+    return StudyService(study, people, records, host, shelves, envs[0].cooking, speed != 1.0)
 
 
 def read_secret(folder: Path) -> bytes:
@@ -139,6 +146,8 @@ class StudyServer:
         for path, (content, kind) in read_files().items():
             app.add_api_route(path, _serve_text(content, kind), response_model=None)
         app.add_api_route("/api/state", self.show_state, response_model=None)
+        for name in ("kitchen", "partner"):
+            app.add_api_route(f"/api/{name}", getattr(self, f"show_{name}"), response_model=None)
         for name in ("session", "consent", "instructions", "answers", "withdraw", "delete"):
             app.add_api_route(f"/api/{name}", getattr(self, f"post_{name}"), methods=["POST"], response_model=None)
         app.add_api_websocket_route("/api/game", self.play_game)
@@ -152,6 +161,22 @@ class StudyServer:
         if who is None:
             return JSONResponse({"status": "new", "title": self.service.study.definition.title})
         return JSONResponse(self.describe_station(who))
+
+    async def show_kitchen(self, request: Request) -> Response:
+        """Rules and pictures of the participant's game, where the browser plays it."""
+        shelf = await self._find_shelf(request)
+        return JSONResponse(await asyncio.to_thread(shelf.pictures.describe))
+
+    async def show_partner(self, request: Request) -> Response:
+        """The partner of the participant's game as a program, where the browser plays it."""
+        shelf = await self._find_shelf(request)
+        return Response(shelf.file, media_type="application/octet-stream")
+
+    async def _find_shelf(self, request: Request) -> PartnerShelf:
+        key = await asyncio.to_thread(self.service.records.find_open, await self._need(request))
+        if not self.service.shelves[key].file:
+            raise Refused("elsewhere")
+        return self.service.shelves[key]
 
     async def post_session(self, request: Request) -> Response:
         """Begin, unless this browser has begun."""
@@ -431,13 +456,12 @@ async def _answer_malformed(_: Request, error: Exception) -> Response:
 def read_files() -> dict[str, tuple[str, str]]:
     """Path -> content and type of all that is served as it is."""
     here = files("popgen.study") / "assets"
-    own = {name: (here / name).read_text(encoding="utf-8") for name in ("study.html", "study.css", "study_page.js")}
+    own = {name: (here / name).read_text(encoding="utf-8") for name in ("study.html", "study.css", *_SCRIPTS)}
     script = "text/javascript; charset=utf-8"
     return {
         "/": (own["study.html"], "text/html; charset=utf-8"),
         "/study.css": (read_asset("pages.css") + own["study.css"], "text/css; charset=utf-8"),
-        "/study_page.js": (own["study_page.js"], script),
-        "/study_game.js": ((here / "study_game.js").read_text(encoding="utf-8"), script),
+        **{f"/{name}": (own[name], script) for name in _SCRIPTS},
     }
 
 

@@ -17,8 +17,9 @@ from popgen.study.study_dry_run import find_last_game, measure_lateness, summari
 from popgen.study.study_tables import ticks
 
 
-def test_simulated_participants_take_part_as_people_do(tmp_path: Path) -> None:
-    study = make_small_study(tmp_path)
+@pytest.mark.parametrize("host", ["server", "browser"])
+def test_simulated_participants_take_part_as_people_do(host: str, tmp_path: Path) -> None:
+    study = make_small_study(tmp_path, host=host)
     casting = Casting(study, [load_population(tmp_path / layout) for layout in LAYOUTS])
     with served(study) as (service, address):
         people = [SimulatedParticipant(address, study, casting, seed) for seed in range(3)]
@@ -33,7 +34,8 @@ def test_simulated_participants_take_part_as_people_do(tmp_path: Path) -> None:
         assert late.steps == told["steps"] and 0 <= late.median <= late.p99 <= late.most
         assert measure_lateness(database, 0.0, find_last_game(database)).steps == 0
         with database.read() as connection:
-            assert connection.scalar(sa.select(sa.func.count()).where(ticks.c.latency_ms.is_not(None)))
+            measured = connection.scalar(sa.select(sa.func.count()).where(ticks.c.latency_ms.is_not(None)))
+            assert bool(measured) == (host == "server")
 
 
 def test_steps_follow_a_clock_that_does_not_drift(tmp_path: Path) -> None:

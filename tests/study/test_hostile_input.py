@@ -38,7 +38,20 @@ def draw_value(rng: np.random.Generator, depth: int = 0) -> Any:
     if depth < 3 and kind == 0:
         return [draw_value(rng, depth + 1) for _ in range(rng.integers(4))]
     if depth < 3 and kind == 1:
-        keys = ("agreed", "version", "form", "answers", "delete", "code", "recruit", "keys", "go", "seen", "ready", "x")
+        keys = (
+            "agreed",
+            "version",
+            "form",
+            "answers",
+            "delete",
+            "code",
+            "recruit",
+            "keys",
+            "go",
+            "steps",
+            "ready",
+            "x",
+        )
         return {str(rng.choice(keys)): draw_value(rng, depth + 1) for _ in range(rng.integers(4))}
     return ODD[rng.integers(len(ODD))]
 
@@ -171,6 +184,11 @@ def test_answers_of_no_form_are_refused(tmp_path: Path) -> None:
         *('{"ready": -1}', '{"seen": 1.5}', '{"ready": 2147483648}', '{"keys": [["a", 1, NaN]]}', "[" * 1000),
         '{"keys": [' + '["a", 1, 1],' * 16 + '["a", 1, 1]]}',
         '{"keys": [["' + "a" * 21 + '", 1, 1]]}',
+        *('{"steps": 3}', '{"steps": [[0, "00", 0, 0, 1, 1]]}', '{"steps": [[0, "0", 0, 0, 1, 1, []]]}'),
+        *('{"steps": [[0, "zz", 0, 0, 1, 1, []]]}', '{"steps": [[0, "00", 0, -1, 1, 1, []]]}'),
+        *('{"steps": [[null, "00", 0, 0, 1, 1, []]]}', '{"steps": [[0, "00", 0, 0, 1, 1, [1]]]}', '{"latency": "1"}'),
+        '{"steps": [' + '[0, "00", 0, 0, 1, 1, []],' * 4 + '[0, "00", 0, 0, 1, 1, []]]}',
+        '{"steps": [[0, "' + "00" * 513 + '", 0, 0, 1, 1, []]]}',
     ],
 )
 def test_what_is_no_message(text: str) -> None:
@@ -181,3 +199,6 @@ def test_what_is_a_message() -> None:
     told = read_game_message('{"keys": [["Space", 1, 3.5]], "go": true, "seen": 4}')
     assert told is not None and told.go and told.seen == 4 and told.ready is None and not told.hidden
     assert [(one.code, one.down, one.at) for one in told.keys] == [("Space", True, 3.5)] and STEPS > 3
+    played = read_game_message('{"steps": [[7, "00ff", 5, 4, 20, 300, []]], "latency": 2}')
+    assert played is not None and played.latency == 2 and played.steps[0].state == b"\x00\xff"
+    assert played.steps[0].actions == (5, 4) and (played.steps[0].time_ms, played.steps[0].late_us) == (20, 300)

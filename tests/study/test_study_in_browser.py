@@ -136,12 +136,14 @@ def play(page: Page, name: str) -> None:
     page.press("Enter")
 
 
-def go_through(page: Page, study: Any) -> str:
-    """From consent to the completion code; gives the code."""
+def go_through(page: Page, study: Any, until: str = "over") -> str:
+    """From consent to the completion code, or to the first page of another kind; gives the code."""
     place = None
     while True:
-        page.wait(f"document.body.dataset.kind && document.body.dataset.place !== '{place}'")
+        page.wait(f"document.body?.dataset.kind && document.body.dataset.place !== '{place}'")
         kind, place = page.ask("[document.body.dataset.kind, document.body.dataset.place]")
+        if kind == until != "over":
+            return ""
         if kind == "over":
             look_at(page, "end")
             return page.ask("document.getElementById('completion').textContent")
@@ -160,12 +162,61 @@ def go_through(page: Page, study: Any) -> str:
         page.press("Enter")
 
 
+def measure_page(page: Page) -> tuple[float, int]:
+    """Seconds from a reload to the first picture of a game, and bytes loaded for it without the partner."""
+    seconds = []
+    for _ in range(3):
+        page.call("Page.reload")
+        script = "document.querySelector('[role=status]')?.textContent.includes('Press Space') && performance.now()"
+        seconds.append(page.wait(script) / 1000)
+    entries = "[...performance.getEntriesByType('resource'), ...performance.getEntriesByType('navigation')]"
+    loaded = page.ask(f"{entries}.map((one) => [one.name, one.transferSize])")
+    return min(seconds), sum(size for name, size in loaded if not name.endswith("/partner"))
+
+
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_a_game_begins_soon_and_follows_the_pages_clock(tmp_path: Path) -> None:
+    study = make_small_study(tmp_path, host="browser")
+    with served(study, speed=1) as (service, address), opened(address, tmp_path) as page:
+        go_through(page, study, until="game")
+        seconds, size = measure_page(page)
+        print(f"\nfirst picture after {seconds:.2f} s, {size:,} bytes")
+        assert seconds < 2 and size < 1_500_000
+        play(page, "measured")
+        with service.people.database.read() as connection:
+            rows = connection.exec_driver_sql("SELECT time_ms, late_us FROM ticks ORDER BY step").all()
+        spans = [after - before for (before, _), (after, _) in itertools.pairwise(rows)]
+        print(f"steps after {sorted(spans)} ms, late by {sorted(late for _, late in rows)} us")
+        assert sorted(spans)[len(spans) // 2] in range(145, 156)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_a_silent_server_is_waited_for(tmp_path: Path) -> None:
+    study = make_small_study(tmp_path, host="browser", steps=20)
+    with served(study, speed=1) as (service, address), opened(address, tmp_path) as page:
+        go_through(page, study, until="game")
+        page.wait("document.querySelector('[role=status]')?.textContent.includes('Press Space')")
+        page.press("Space")
+        page.wait("document.querySelector('.bar').textContent.includes('Time left: 2 s')")
+        for game in list(service.host._games):  # type: ignore[attr-defined]
+            service.host._games[game].tell = lambda told: None  # type: ignore[attr-defined]
+        page.wait("document.querySelector('[role=status]').textContent.includes('waits for the server')")
+        left = page.ask("document.querySelector('.bar').textContent")
+        page.call("Page.reload")
+        page.wait("document.querySelector('[role=status]')?.textContent.includes('Press Space to go on')")
+        assert page.ask("document.querySelector('.bar').textContent") == left  # all steps were recorded
+        play(page, "after")
+        checked = check_recordings(study, service.people.database)
+        assert (checked[0].steps, checked[0].problem, checked[0].status) == (20, None, "finished")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+@pytest.mark.parametrize("host", ["browser", "server"])
 @pytest.mark.parametrize("size", [(1280, 720), (640, 360)], ids=["1280x720", "200 %"])
-def test_consent_to_code_by_keyboard_alone(size: tuple[int, int], tmp_path: Path) -> None:
-    if size[0] == 640 and "POPGEN_AXE" not in os.environ and "POPGEN_PICTURES" not in os.environ:
-        pytest.skip("the long way at 200 % is walked where its pages are looked at")
-    study = make_small_study(tmp_path)
+def test_consent_to_code_by_keyboard_alone(host: str, size: tuple[int, int], tmp_path: Path) -> None:
+    if (size[0] == 640 or host == "server") and not {"POPGEN_AXE", "POPGEN_PICTURES"} & set(os.environ):
+        pytest.skip("the long way at 200 %, and with games in the server, is walked where its pages are looked at")
+    study = make_small_study(tmp_path, host=host)
     with served(study, speed=1) as (service, address), opened(address, tmp_path, *size) as page:
         page.wait("document.body?.dataset.kind === 'consent'")
         assert page.ask("location.search") == ""  # the platform's number is not left in the address

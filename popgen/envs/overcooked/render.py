@@ -6,6 +6,7 @@ a pot that cooks shows the steps left and one that is ready a tick.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -100,6 +101,48 @@ def as_rgb(kitchen: Kitchen, row: np.ndarray) -> np.ndarray:
         cell = (int(row[i]) % layout.width, int(row[i]) // layout.width)
         _cut_tile(picture, cell)[:] = _paint_player(i, int(row[k.ORIENT + i]) & 3, int(row[k.HELD + i]))
     return picture
+
+
+@dataclass(frozen=True)
+class KitchenTiles:
+    """All that can be seen in the cells of a kitchen, as numbers of pictures.
+
+    Attributes:
+        pictures: (N, 32, 32, 3) uint8, each once.
+        ground: (H * W,) of cells with nobody and nothing in them, row by row.
+        pots: (contents, cooking byte) -> number.
+        counters: object code -> number.
+        players: (player, orientation, held object) -> number.
+    """
+
+    pictures: np.ndarray
+    ground: list[int]
+    pots: dict[tuple[int, int], int]
+    counters: dict[int, int]
+    players: dict[tuple[int, int, int], int]
+
+
+def list_tiles(kitchen: Kitchen) -> KitchenTiles:
+    """Paint everything that the kitchen can show."""
+    numbers: dict[bytes, int] = {}
+
+    def number_tile(tile: np.ndarray) -> int:
+        return numbers.setdefault(tile.tobytes(), len(numbers))
+
+    layout, table = kitchen.layout, kitchen.tables.table
+    cells = [(x, y) for y in range(layout.height) for x in range(layout.width)]
+    items = [code for code in range(1, 256) if table[k.ITEM_BIT, code] >= 0]
+    contents = [code for code in range(1, 256) if table[k.POT_BIT, code] >= 0]
+    steps = range(int(kitchen.tables.meta[k.M_COOK]) + 2)
+    pots = {(code, cooking): number_tile(_paint_pot(code, cooking)) for code in contents for cooking in steps}
+    hands = [(player, side, held) for player in (0, 1) for side in range(4) for held in (0, *items)]
+    return KitchenTiles(
+        ground=[number_tile(_paint_ground(layout.tile(cell))) for cell in cells],
+        pots={(0, 0): number_tile(_paint_pot(0, 0)), **pots},
+        counters={code: number_tile(_paint_counter(code)) for code in items},
+        players={hand: number_tile(_paint_player(*hand)) for hand in hands},
+        pictures=np.stack([np.frombuffer(tile, np.uint8).reshape(TILE, TILE, 3) for tile in numbers]),
+    )
 
 
 def _cut_tile(picture: np.ndarray, cell: tuple[int, int]) -> np.ndarray:

@@ -209,3 +209,22 @@ export class Kitchen {
     }
   }
 }
+
+// Numbers of tiles by cell, of what popgen/study/browser_kitchen.py says there can be.
+export function listTiles(kitchen, state) {
+  const { names, meta, told: { tiles } } = kitchen;
+  const cells = tiles.ground.slice();
+  const counters = names.POTS + 2 * meta[names.M_POTS];
+  tiles.pot_cells.forEach((cell, pot) => {
+    const slot = names.POTS + 2 * pot;
+    cells[cell] = tiles.pots[`${state[slot]},${state[slot + 1]}`] ?? cells[cell];
+  });
+  tiles.counter_cells.forEach((cell, counter) => {
+    cells[cell] = tiles.counters[state[counters + counter]] ?? cells[cell];
+  });
+  for (const player of [0, 1]) {
+    const hand = [player, state[names.ORIENT + player] & 3, state[names.HELD + player]];
+    cells[state[player]] = tiles.players[hand.join(",")];
+  }
+  return cells;
+}

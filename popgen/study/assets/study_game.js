@@ -1,4 +1,6 @@
-// A game: draws what the server tells, sends keys with their times. See popgen/study/game_host.py.
+// A game: draws what the server tells and sends keys with their times (popgen/study/game_host.py), or plays here and
+// sends what was played (browser_game.js).
+import { openBrowserGame } from "./browser_game.js";
 
 const TILE = 32;
 const CODES = {
@@ -43,7 +45,7 @@ class Game {
     this.canvas.addEventListener("keyup", (event) => this.key(event, 0));
     this.canvas.addEventListener("blur", () => this.release());
     this.canvas.addEventListener("focus", () => this.running || this.tell());
-    this.onHidden = () => document.hidden && this.running && this.send({ hidden: true });
+    this.onHidden = () => document.hidden && this.running && this.hide();
     document.addEventListener("visibilitychange", this.onHidden);
   }
 
@@ -59,7 +61,19 @@ class Game {
   }
 
   send(told) {
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(told));
+    const open = this.socket.readyState === WebSocket.OPEN;
+    if (open) this.socket.send(JSON.stringify(told));
+    return open;
+  }
+
+  hide() {
+    if (!this.local) {
+      this.send({ hidden: true });
+      return;
+    }
+    this.local.pause();
+    this.running = false;
+    this.tell();
   }
 
   say(text, strong = false) {
@@ -73,7 +87,10 @@ class Game {
   }
 
   async take(told) {
+    if (told.begin?.host === "browser") this.local = await openBrowserGame(told, this);
     if (told.begin) this.begin(told.begin);
+    if (told.begin && this.local) this.showStep(this.local);
+    if (told.kept !== undefined) this.local?.keep(told.kept);
     if (told.tiles) {
       const images = await Promise.all(told.tiles.map((tile) => loadTile(tile[1])));
       told.tiles.forEach((tile, index) => this.tiles.set(tile[0], images[index]));
@@ -84,8 +101,17 @@ class Game {
       this.running = false;
       this.tell();
     }
-    if (told.warning) this.say(`Are you there? Without a key the game ends in ${told.warning} seconds.`, true);
+    if (told.warning) this.warn(told.warning);
     if (told.over) await this.finish(told);
+  }
+
+  warn(seconds) {
+    this.say(`Are you there? Without a key the game ends in ${seconds} seconds.`, true);
+  }
+
+  stall(waits = true) {
+    if (waits) this.say("The game waits for the server.", true);
+    else this.say("The game is on.");
   }
 
   begin(told) {
@@ -106,8 +132,17 @@ class Game {
       const cell = told.cells[i];
       context.drawImage(this.tiles.get(told.cells[i + 1]), (cell % columns) * TILE, Math.floor(cell / columns) * TILE);
     }
-    this.step = told.step;
     if (told.step && told.step % 4 === 0) this.send({ seen: told.step });
+    this.showNumbers(told);
+  }
+
+  showStep(local) {
+    local.draw(this.canvas.getContext("2d"), TILE);
+    this.showNumbers(local);
+  }
+
+  showNumbers(told) {
+    this.step = told.step;
     const left = Math.ceil(((this.begun.steps - told.step) * this.state.step_ms) / 1000);
     this.time.textContent = `Time left: ${left} s`;
     this.points.textContent = `Soups: ${told.score}`;
@@ -125,23 +160,30 @@ class Game {
         this.running = true;
         this.say("The game is on.");
         this.send({ go: true });
+        this.local?.start();
       }
       return;
     }
     if (this.notice.classList.contains("strong")) this.say("The game is on.");
-    this.send({ keys: [[code, down, Math.round(event.timeStamp * 10) / 10]] });
+    this.sendKeys([[code, down, Math.round(event.timeStamp * 10) / 10]]);
+  }
+
+  sendKeys(keys) {
+    if (this.local) for (const key of keys) this.local.key(...key);
+    else this.send({ keys });
   }
 
   release() {
     if (!this.running || this.over) return;
     const codes = ["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight", "Space"];
-    this.send({ keys: codes.map((code) => [code, 0, Math.round(performance.now() * 10) / 10]) });
+    this.sendKeys(codes.map((code) => [code, 0, Math.round(performance.now() * 10) / 10]));
     this.say("The game runs on. Click the kitchen or press Tab until it has the frame, to play.", true);
   }
 
   async finish(told) {
     this.over = true;
     this.running = false;
+    this.local?.pause();
     const texts = {
       finished: `The game is over. Soups: ${told.score}.`,
       void: "The game ended because no key was pressed.",
@@ -159,6 +201,7 @@ class Game {
   closed(code) {
     document.removeEventListener("visibilitychange", this.onHidden);
     this.running = false;
+    this.local?.pause();
     if (this.over || current !== this) return;
     this.over = true;
     if (code === 4000) this.onOver();
@@ -181,6 +224,7 @@ class Game {
 export function playGame(place, state, onOver, make) {
   if (current && !current.over) {
     current.over = true;
+    current.local?.pause();
     current.socket.close();
   }
   current = new Game(place, state, onOver, make);

@@ -1,6 +1,6 @@
 // Works on what popgen/study/script_engine.py asks, in a browser or in Node: fetches a task, answers, fetches the next.
 import { Partner } from "./ego_network.js";
-import { Kitchen } from "./kitchen_rules.js";
+import { Kitchen, listTiles } from "./kitchen_rules.js";
 
 // Rows of a state and two actions -> rows of the next state, reward (4 bytes), score, truncated, events of both
 // players, and `features` of both players before the step.
@@ -54,7 +54,17 @@ function playPartner(told, bytes) {
   return out;
 }
 
-const tasks = { transitions: playTransitions, partner: playPartner };
+// States -> numbers of tiles (2 bytes each), cell by cell.
+function lookAtStates(told, bytes) {
+  const kitchen = new Kitchen(told.kitchen);
+  const numbers = [];
+  for (let at = 0; at < bytes.length; at += kitchen.size) {
+    numbers.push(...listTiles(kitchen, bytes.subarray(at, at + kitchen.size)));
+  }
+  return new Uint8Array(Uint16Array.from(numbers).buffer);
+}
+
+const tasks = { transitions: playTransitions, partner: playPartner, tiles: lookAtStates };
 
 // A task is the length of its JSON (4 bytes), the JSON, and bytes.
 export async function workOn(address) {
