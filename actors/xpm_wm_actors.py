@@ -13,7 +13,7 @@ from popgen.config.sections import EnvConfig
 from popgen.methods.training import Pending
 from popgen.methods.transport import Transport, Worker
 from popgen.methods.xpm_wm.agent import AgentLearner
-from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.imagination import OLD, Starts
 from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
@@ -92,7 +92,7 @@ class WorldModelActor:
 
     def __init__(
         self,
-        config: XpmWmRun,
+        config: WorldModelRun,
         seed: int,
         threads: int,
         replays: tuple[Worker[ReplayActor], Worker[ReplayActor]],
@@ -204,7 +204,7 @@ class WorldModelActor:
 class AgentActor:
     """Thin: every number is made by `AgentLearner`."""
 
-    def __init__(self, config: XpmWmRun, threads: int, transport: Transport) -> None:
+    def __init__(self, config: WorldModelRun, threads: int, transport: Transport) -> None:
         limit_threads(threads)
         self.config, self.transport = config, transport
         self.spec = build_env(config.env, 1).spec

@@ -11,7 +11,8 @@ from popgen.actors.xpm_wm_actors import AgentActor, ReplayActor, WorldModelActor
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport, Worker
-from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.config import FcpWmRun, WorldModelRun
+from popgen.methods.xpm_wm.fcp import FcpWmTraining
 from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.real_play import Tally
@@ -43,7 +44,7 @@ class DelayedWeights:
 class XpmWmWorkers:
     """See `popgen.methods.xpm_wm.workers.Workers`."""
 
-    def __init__(self, config: XpmWmRun, attempt: str, transport: Transport) -> None:
+    def __init__(self, config: WorldModelRun, attempt: str, transport: Transport) -> None:
         self.transport, self.attempt = transport, attempt
         cluster, seed, start = config.cluster, config.run.seed * 1000, transport.start
         self.pool = start_samplers(config, attempt, transport)
@@ -194,6 +195,11 @@ class XpmWmWorkers:
             worker.end()
 
 
-def open_training(config: XpmWmRun, spec: EnvSpec, attempt: str, transport: Transport) -> XpmWmTraining:
+def open_training(config: WorldModelRun, spec: EnvSpec, attempt: str, transport: Transport) -> XpmWmTraining:
     """Start the workers of one attempt; see `popgen.methods.transport.OpenTraining`."""
     return XpmWmTraining(config, spec, XpmWmWorkers(config, attempt, transport))
+
+
+def open_skilled_training(config: FcpWmRun, spec: EnvSpec, attempt: str, transport: Transport) -> FcpWmTraining:
+    """The same, each later seed kept at several skills."""
+    return FcpWmTraining(config, spec, XpmWmWorkers(config, attempt, transport))

@@ -91,7 +91,8 @@ class Method:
         continuation: what a population to continue must have in common; None where the method cannot continue one.
         objectives: its rows in a table of self-sabotage: name -> settings on top of a recipe. A name means the same in
             every method: `self-play` (no partner), `paper` (the paper's objective) and `ours` (with our options).
-        multiple: its members come in so many at a time.
+        multiple: its members come in so many at a time,
+        alone: after so many that come one by one.
         trains_ego: its population of one is an ego agent, which plays with others.
     """
 
@@ -110,7 +111,13 @@ class Method:
     continuation: Continuation | None = None
     objectives: Mapping[str, Settings] = field(default_factory=dict)
     multiple: int = 1
+    alone: int = 0
     trains_ego: bool = False
+
+    def fit_size(self, least: int) -> int:
+        """Members of the smallest population of whole groups that has at least so many."""
+        groups = -(-max(0, least - self.alone) // self.multiple)
+        return self.alone + groups * self.multiple
 
     def load_training(self) -> OpenTraining:
         """The start of its workers."""

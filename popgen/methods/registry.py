@@ -25,6 +25,8 @@ GROUP = "popgen.methods"
 
 BUILT_IN: dict[str, str] = {
     "xpm_wm": "popgen.methods.xpm_wm.method:METHOD",
+    "fcp_wm": "popgen.methods.xpm_wm.method:FCP_WM",
+    "mep_wm": "popgen.methods.xpm_wm.method:MEP_WM",
     "xpm_sim": "popgen.methods.xpm_sim.method:METHOD",
     "lipo": "popgen.methods.mappo.method:LIPO",
     "comedi": "popgen.methods.mappo.method:COMEDI",

@@ -230,6 +230,9 @@ def _check_start(config: RunConfig, spec: EnvSpec, method: Method) -> None:
     check_compatible(population, spec)
     if wanted > len(population):
         raise UserError("population.init_members", f"{wanted}, but {run} has {len(population)}", "lower it")
+    if run.resolve().name == config.run.id:
+        problem = f"is {config.run.id}, as that of the run it continues, whose samplers have the same names then"
+        raise UserError("run.id", problem, "choose another")
     if wanted >= config.population.size:
         problem = f"{config.population.size} leaves nothing to train after {wanted} members of {run}"
         raise UserError("population.size", problem, "raise it above population.init_members")

@@ -205,6 +205,7 @@ INIT = {
     "more members than there are": (["population.init_members=3", "population.size=4"], "population.init_members"),
     "nothing left to train": (["population.init_members=2", "population.size=2"], "population.size"),
     "no checkpoint": (["population.init_members=2"], "checkpoint"),
+    "the name of its origin": (["run.id=old"], "run.id"),
     "another world model": (["world_model.units=24"], "world_model.units"),
     "another actor": (["agent.layers=2"], "agent.layers"),
 }

@@ -12,7 +12,6 @@ from popgen.methods.mappo.config import (
     TrajediRun,
 )
 from popgen.methods.mappo.needs import (
-    SKILLS,
     check_comedi,
     check_fcp,
     check_hsp,
@@ -34,6 +33,7 @@ from popgen.methods.mappo.recipes import (
     RECIPES,
 )
 from popgen.methods.method import Method
+from popgen.methods.skill_checkpoints import SKILLS
 
 MAPPO = Method(
     name="mappo",

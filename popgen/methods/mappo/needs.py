@@ -11,10 +11,8 @@ from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, count_numbers
 from popgen.methods.mappo.config import BaselineRun, BpRun, ComediRun, FcpRun, HspConfig, HspRun, LipoRun, PpoConfig
 from popgen.methods.method import ActorDemand, Needs, ask_for
-from popgen.types import BIASED_ROLE, FINAL_SKILL, PARTNER_ROLE
-
-SKILLS = ("initial", "half", FINAL_SKILL)
-"""Of the members of a seed of FCP, in order."""
+from popgen.methods.skill_checkpoints import SKILLS
+from popgen.types import BIASED_ROLE, PARTNER_ROLE
 
 
 def list_actors(config: BaselineRun) -> list[ActorDemand]:

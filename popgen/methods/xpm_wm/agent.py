@@ -42,6 +42,7 @@ from popgen.methods.xpm_wm.imagination import (
     start_latents,
 )
 from popgen.methods.xpm_wm.latent_filter import Latent
+from popgen.methods.xpm_wm.population_bonus import surprise_bonus
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
@@ -234,15 +235,25 @@ class AgentLearner:
     # ---- what a batch teaches ------------------------------------------------------------------------------------
 
     def self_play(self, imagined: Imagined) -> PolicyTarget:
-        """+J_SP, which sets the unit of all advantages; with the count bonus, where there is one."""
-        scale = self.discovery.bonus_scale(self.plays)
-        if not scale:
+        """+J_SP, which sets the unit of all advantages; with the bonuses, where there are any."""
+        bonuses = self.bonuses(imagined)
+        if not bonuses:
             return self_play_target(self.networks, imagined, self.entropy_now())
-        bonus = self.discovery.bonus(self.model, imagined.latent[1:], scale)
-        paid = replace(imagined, reward=imagined.reward + bonus)
+        paid = replace(imagined, reward=imagined.reward + torch.stack(list(bonuses.values())).sum(0))
         target = self_play_target(self.networks, paid, self.entropy_now())
-        figures = {"imagined_shaped_sp": float(imagined.reward.mean()), "count_bonus": float(bonus.mean())}
-        return replace(target, figures=target.figures | figures)
+        figures = {name: float(bonus.mean()) for name, bonus in bonuses.items()}
+        return replace(target, figures=target.figures | figures | {"imagined_shaped_sp": float(imagined.reward.mean())})
+
+    def bonuses(self, imagined: Imagined) -> dict[str, Tensor]:
+        """What imagined self-play earns beside the reward, (H, B) by name: for states that were seldom seen, and for
+        what the population seldom does."""
+        found: dict[str, Tensor] = {}
+        if scale := self.discovery.bonus_scale(self.plays):
+            found["count_bonus"] = self.discovery.bonus(self.model, imagined.latent[1:], scale)
+        if self.config.surprise and self.partners:
+            actors = [*self.partners.values(), self.networks.rollout_actor]
+            found["surprise_bonus"] = surprise_bonus(self.config, actors, imagined)
+        return found
 
     def cross_play(self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor) -> PolicyTarget:
         """-lambda_XP J_XP, in self-play's unit; what is earned with the partner is remembered."""

@@ -188,6 +188,11 @@ class AgentConfig(CrossPlayOptions):
     """Strongest partner by real cross-play returns: of its latest round, or of all its episodes."""
     partner_random: Fraction = 0.3
     """Share of updates with a random partner in the strongest one's place: no critic is forgotten."""
+    surprise: Weight = 0.0
+    """Reward in a later member's imagined self-play, for each nat of the population's surprise and seat, where the
+    training reward of a dish is 18 or more (MEP's alpha); 0: none."""
+    surprise_floor: Rate = 1e-5
+    """Least probability that counts for it: it bounds what one step can earn."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of imagination; `auto`: bfloat16 where the device multiplies it natively."""
 
@@ -294,8 +299,9 @@ class Phase2Config(Schema):
     """Adam's step size of the world model in phase 2."""
     episodes_sp: Batch = 8
     """Real self-play episodes in a round."""
-    episodes_xp: Batch = 8
-    """Real cross-play episodes in a round, over all partners; at least one in each seating with each."""
+    episodes_xp: NonNegative = 8
+    """Real cross-play episodes in a round, over all partners, at least one in each seating with each; 0: members meet
+    nobody, which needs `agent.lambda_xp=0`."""
     rounds: Positive = 8
     """Rounds of real episodes of each member."""
     max_rounds: Positive = 9
@@ -369,11 +375,9 @@ class WatchConfig(Schema):
     """Reports in a row with such a precision before a line is written."""
 
 
-class XpmWmRun(RunConfig):
-    """A run of XPM-WM."""
+class WorldModelRun(RunConfig):
+    """What the runs of all methods that train members in a world model have."""
 
-    method: Literal["xpm_wm"] = "xpm_wm"
-    """Cross-play minimisation in a learned world model."""
     world_model: WorldModelConfig = WorldModelConfig()
     """The two-player world model."""
     agent: AgentConfig = AgentConfig()
@@ -390,7 +394,7 @@ class XpmWmRun(RunConfig):
     """When a run says that training goes wrong."""
 
     @model_validator(mode="after")
-    def _check_reward_head(self) -> XpmWmRun:
+    def _check_reward_head(self) -> WorldModelRun:
         """Discovery judges imagined events, which a scalar head does not tell."""
         discovery = self.discovery
         if self.world_model.reward_head == "scalar" and (
@@ -401,7 +405,20 @@ class XpmWmRun(RunConfig):
         return self
 
     @model_validator(mode="after")
-    def _check_windows(self) -> XpmWmRun:
+    def _check_cross_play(self) -> WorldModelRun:
+        """Whoever is trained against partners must meet them."""
+        if self.phase2.episodes_xp == 0 and self.agent.lambda_xp > 0.0:
+            problem = f"is 0, but agent.lambda_xp={self.agent.lambda_xp:g} needs to know the strongest partner"
+            raise UserError("phase2.episodes_xp", problem, "raise it, or set agent.lambda_xp=0")
+        return self
+
+    @property
+    def heeds_predecessors(self) -> bool:
+        """Does a member's training depend on those before it?"""
+        return self.phase2.episodes_xp > 0 or self.agent.surprise > 0.0
+
+    @model_validator(mode="after")
+    def _check_windows(self) -> WorldModelRun:
         """Every segment must hold a window of the reports, the caches some windows, the replays a segment."""
         phase, window = self.phase1, self.world_model.length + OPEN_LOOP
         prefill = min(PREFILL_CHUNK, phase.prefill_steps // phase.envs)
@@ -418,3 +435,24 @@ class XpmWmRun(RunConfig):
         if self.phase2.cache < 4 * self.world_model.length:
             raise UserError("phase2.cache", "is less than four times world_model.length", "raise it")
         return self
+
+
+class XpmWmRun(WorldModelRun):
+    """A run of XPM-WM."""
+
+    method: Literal["xpm_wm"] = "xpm_wm"
+    """Cross-play minimisation in a learned world model."""
+
+
+class FcpWmRun(WorldModelRun):
+    """A run of FCP in a world model."""
+
+    method: Literal["fcp_wm"] = "fcp_wm"
+    """Self-play in a learned world model, each later seed kept at three skills."""
+
+
+class MepWmRun(WorldModelRun):
+    """A run of MEP in a world model."""
+
+    method: Literal["mep_wm"] = "mep_wm"
+    """Self-play in a learned world model, paid for the population's entropy."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
 from popgen.methods.training import Pending, State
 from popgen.methods.xpm_wm.config import WatchConfig
 from popgen.methods.xpm_wm.imagination import Starts
@@ -263,6 +264,7 @@ class LaterMemberProgress:
         best: the policy of the best round.
         figures: of the last round.
         watch: signs of trouble so far.
+        skills: policies on the way by their real self-play; None where the best alone is kept.
     """
 
     strength: PartnerStrength
@@ -274,6 +276,12 @@ class LaterMemberProgress:
     since_best: int = 0
     watch: Watch = field(default_factory=Watch)
     constraint: PartnerConstraint = field(default_factory=lambda: PartnerConstraint(None, 0.0))
+    skills: SkillCheckpoints | None = None
+
+    def keep_skill(self, scored: Candidate) -> None:
+        """The policy of a round, where such are kept."""
+        if self.skills is not None:
+            self.skills.add(SkillCheckpoint(self.steps, scored.sp, scored.weights.acting.result()))
 
     @property
     def best_shown(self) -> dict[str, float]:
@@ -291,6 +299,7 @@ class LaterMemberProgress:
             "best": self.best.to_state(),
             "strength": self.strength.state(),
             "constraint": self.constraint.state(),
+            "skills": None if self.skills is None else self.skills.state(),
         }
 
     def load_state(self, state: State, put: Put) -> None:
@@ -300,3 +309,4 @@ class LaterMemberProgress:
         self.best = Candidate.from_state(state["best"], put)
         self.rounds, self.plays = int(state["rounds"]), bool(state["plays"])
         self.since_best, self.watch = int(state["since_best"]), Watch.from_state(state["watch"])
+        self.skills = None if state["skills"] is None else SkillCheckpoints.from_state(state["skills"])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Loop, Pending, PlannedPhase, Progress, State, TrainedMember
 from popgen.methods.xpm_wm import phase_rules as rules
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
-from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
@@ -20,7 +21,7 @@ ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS = 8e-5, 5e-5, 5e-6
 """On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step."""
 
 
-def plan_phases(config: XpmWmRun, spec: EnvSpec) -> list[PlannedPhase]:
+def plan_phases(config: WorldModelRun, spec: EnvSpec) -> list[PlannedPhase]:
     """What all members will go through; costs are those of the updates, at the laptop's sizes."""
     one, two, agent = config.phase1, config.phase2, config.agent
     model_update = config.world_model.batch * config.world_model.length * ROW_SECONDS
@@ -34,7 +35,7 @@ def plan_phases(config: XpmWmRun, spec: EnvSpec) -> list[PlannedPhase]:
         PlannedPhase(rules.SELF_PLAY, FIRST, rounds * each, earliest=0.0),
     ]
     for member in range(FIRST + 1, config.population.size + 1):
-        most = rules.most_rounds(two, max(two.episodes_xp, 2 * (member - 1)), spec.horizon)
+        most = rules.most_rounds(two, rules.cross_play_episodes(two, member - 1), spec.horizon)
         updates = rules.count_imagination(two, most)
         cost = updates * together + (most - 1) * two.model_updates * model_update
         earliest = rules.count_imagination(two, min(two.rounds, most)) / updates
@@ -48,7 +49,7 @@ class XpmWmTraining:
     learners = LEARNERS
     begins_workers = False
 
-    def __init__(self, config: XpmWmRun, spec: EnvSpec, work: Workers) -> None:
+    def __init__(self, config: WorldModelRun, spec: EnvSpec, work: Workers) -> None:
         self.config, self.spec, self.work = config, spec, work
         self.log_rows = max(1, config.replay.capacity // 2)
         self.weights: dict[int, Weights] = {}
@@ -86,7 +87,7 @@ class XpmWmTraining:
         self.member, self.seed = first, self.config.run.seed * 1000 + first
         self.began, self.resumed = time.time(), False
         self.progress = self._fresh_progress(0)
-        self.work.begin_member(first, self.seed, self.weights)
+        self.work.begin_member(first, self.seed, self.weights if self.config.heeds_predecessors else {})
         return (first,)
 
     def train(self) -> Loop:
@@ -130,8 +131,13 @@ class XpmWmTraining:
             f"{steps:,} environment steps, {seconds / 60:.1f} min"
         )
         left = {**self.work.buffers_state(), "model": self.work.model_state()}
-        yield TrainedMember(self.member, policy, training, self.seed, extra, left, note)
-        self._archive(self.member, acting)
+        for trained in self.finish_members(TrainedMember(self.member, policy, training, self.seed, extra, left, note)):
+            yield trained
+            self._archive(trained.member, trained.policy.weights())
+
+    def finish_members(self, final: TrainedMember) -> Iterator[TrainedMember]:
+        """All that this training gives."""
+        yield final
 
     # ---- checkpoints -----------------------------------------------------------------------------------------------
 

@@ -6,10 +6,11 @@ from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, buffer_bytes, count_numbers, observation_entries, segment_bytes
 from popgen.methods.method import ActorDemand, Needs, ask_for
-from popgen.methods.xpm_wm.config import OPEN_LOOP, PREFILL_CHUNK, XpmWmRun
+from popgen.methods.skill_checkpoints import SKILLS
+from popgen.methods.xpm_wm.config import OPEN_LOOP, PREFILL_CHUNK, FcpWmRun, WorldModelRun
 
 
-def list_actors(config: XpmWmRun) -> list[ActorDemand]:
+def list_actors(config: WorldModelRun) -> list[ActorDemand]:
     """Samplers, two replays and two learners."""
     cluster = config.cluster
     return [
@@ -20,7 +21,7 @@ def list_actors(config: XpmWmRun) -> list[ActorDemand]:
     ]
 
 
-def estimate_needs(config: XpmWmRun, spec: EnvSpec) -> Needs:
+def estimate_needs(config: WorldModelRun, spec: EnvSpec) -> Needs:
     """Bytes. A finished member leaves the buffers behind, and the world model with its optimiser; the running one's
     checkpoints hold two copies and a log of the buffers, and one more is being written."""
     model, agent = config.world_model, config.agent
@@ -41,7 +42,7 @@ def estimate_needs(config: XpmWmRun, spec: EnvSpec) -> Needs:
     )
 
 
-def _build_networks(config: XpmWmRun, spec: EnvSpec) -> list[object]:
+def _build_networks(config: WorldModelRun, spec: EnvSpec) -> list[object]:
     """World model, actor, and a critic for each partner of the last member."""
     from popgen.methods.xpm_wm.actor_critic import Actor, Critic
     from popgen.methods.xpm_wm.world_model import WorldModel
@@ -51,7 +52,7 @@ def _build_networks(config: XpmWmRun, spec: EnvSpec) -> list[object]:
     return [WorldModel(model, spec), Actor(agent, model, spec.num_actions), *critics]
 
 
-def check_run(config: XpmWmRun, spec: EnvSpec) -> None:
+def check_run(config: WorldModelRun, spec: EnvSpec) -> None:
     """Refuse what does not fit the environment.
 
     Raises:
@@ -65,7 +66,23 @@ def check_run(config: XpmWmRun, spec: EnvSpec) -> None:
     _check_discovery(config, spec)
 
 
-def _check_view(config: XpmWmRun, spec: EnvSpec) -> None:
+def check_fcp(config: FcpWmRun, spec: EnvSpec) -> None:
+    """The same, and whole seeds after member 1.
+
+    Raises:
+        UserError: what `check_run` refuses, or members, new ones or those taken over, that are no whole seeds.
+    """
+    check_run(config, spec)
+    population, each = config.population, len(SKILLS)
+    sizes = {"size": population.size} | ({"init_members": population.init_members} if population.init_from else {})
+    for name, size in sizes.items():
+        if left := (size - 1) % each:
+            problem = f"{size} is not 1 and a multiple of {each}: each seed after member 1 gives an initial, a half"
+            fix = f"set it to {size + each - left}"
+            raise UserError(f"population.{name}", f"{problem} trained and a final member", fix)
+
+
+def _check_view(config: WorldModelRun, spec: EnvSpec) -> None:
     view = config.world_model.view
     if view not in spec.views:
         raise UserError(
@@ -73,7 +90,7 @@ def _check_view(config: XpmWmRun, spec: EnvSpec) -> None:
         )
 
 
-def _check_lengths(config: XpmWmRun, spec: EnvSpec) -> None:
+def _check_lengths(config: WorldModelRun, spec: EnvSpec) -> None:
     window, phase = config.world_model.length + OPEN_LOOP, config.phase2
     if window > spec.horizon:
         problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
@@ -84,7 +101,7 @@ def _check_lengths(config: XpmWmRun, spec: EnvSpec) -> None:
         raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
 
 
-def _check_discovery(config: XpmWmRun, spec: EnvSpec) -> None:
+def _check_discovery(config: WorldModelRun, spec: EnvSpec) -> None:
     view = spec.views[config.world_model.view]
     if config.discovery.count_bonus and not (view.own and view.binary):
         problem = f"view {config.world_model.view!r} of {spec.name} does not tell a player's own state apart"

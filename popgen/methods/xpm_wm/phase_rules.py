@@ -188,6 +188,11 @@ def choose_first(progress: FirstMemberProgress) -> Candidate:
 # ---- rules of phase 2 ------------------------------------------------------------------------------------------------
 
 
+def cross_play_episodes(phase: Phase2Config, partners: int) -> int:
+    """Of one round: at least one in each seating with each partner; none where members meet nobody."""
+    return max(phase.episodes_xp, 2 * partners) if phase.episodes_xp else 0
+
+
 def most_rounds(phase: Phase2Config, episodes_xp: int, horizon: int) -> int:
     """Rounds of real episodes at most: those configured, fewer where the environment steps end first."""
     most, each = max(phase.rounds, phase.max_rounds), (phase.episodes_sp + episodes_xp) * horizon
@@ -213,7 +218,7 @@ def judge_round(
     for partner, met in cross.items():
         progress.strength.add(partner, [e.shaped for e in met])
     scores = {k: float(np.mean([e.score for e in met])) for k, met in cross.items()}
-    strongest = max(scores.values())
+    strongest = max(scores.values(), default=0.0)
     candidate = Candidate(published, float(np.mean([e.score for e in own])), strongest)
     limit = progress.constraint.limit
     progress.constraint.add(scores, candidate.sp)
@@ -223,7 +228,7 @@ def judge_round(
     progress.rounds += 1
     progress.figures = {
         "real_sp": candidate.sp,
-        "real_xp_max": strongest,
+        **({"real_xp_max": strongest} if scores else {}),
         "real_shaped_sp": float(np.mean([e.shaped for e in own])) / horizon,
         "round": progress.rounds,
     }
@@ -232,7 +237,8 @@ def judge_round(
 
 def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name: str) -> str:
     """A round in a line."""
-    scores = f"SP {scored.sp:.2f}, strongest XP {scored.xp:.2f} {score_name}"
+    met = f", strongest XP {scored.xp:.2f}" if "real_xp_max" in progress.figures else ""
+    scores = f"SP {scored.sp:.2f}{met} {score_name}"
     return f"round {progress.rounds}: {scores}, {progress.steps:,} steps"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
 from popgen.methods.training import Pending, PolicySnapshot, Sampled
-from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.matches import Match
@@ -20,13 +20,13 @@ from popgen.types import RANDOM_MEMBER, Kind, Segment
 Pair = tuple[int, int]
 
 
-def policy_snapshot(config: XpmWmRun, acting: Pending[Weights]) -> PolicySnapshot:
+def policy_snapshot(config: WorldModelRun, acting: Pending[Weights]) -> PolicySnapshot:
     """A member's policy as it travels to a sampler."""
     sizes = {"world_model": config.world_model.model_dump(mode="json"), "agent": config.agent.model_dump(mode="json")}
     return PolicySnapshot("world_model", sizes, acting)
 
 
-def policy_snapshots(config: XpmWmRun, acting: Mapping[int, Pending[Weights]]) -> dict[int, PolicySnapshot]:
+def policy_snapshots(config: WorldModelRun, acting: Mapping[int, Pending[Weights]]) -> dict[int, PolicySnapshot]:
     """Policies of members by their acting weights."""
     return {member: policy_snapshot(config, weights) for member, weights in acting.items()}
 
@@ -58,6 +58,8 @@ def seatings(member: int, partners: Sequence[int]) -> list[Pair]:
 
 def later_matches(member: int, pairs: Sequence[Pair], episodes_sp: int, episodes_xp: int, seed: int) -> list[Match]:
     """Self-play, and cross-play of every pair, in an order drawn by `seed`: an episode in each environment."""
+    if not pairs:
+        return [self_play_match(member, episodes_sp)]
     order = np.random.default_rng(seed).permutation(len(pairs))
     counts = np.bincount(np.arange(episodes_xp) % len(pairs), minlength=len(pairs))
     cross = [Match(Kind.XP, pairs[i], int(n)) for i, n in zip(order, counts, strict=True)]

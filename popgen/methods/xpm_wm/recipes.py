@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from popgen.methods.recipe import Recipe, because, ours
+from collections.abc import Mapping
+
+from popgen.methods.recipe import Recipe, Settings, because, ours
 
 _CHANCE = "chance must find the first soups, and better ways later (docs/notes/learning.md, More chance)"
 _FALSE_DELIVERIES = "imagined deliveries must not outnumber real ones (docs/notes/learning.md, The counter circuit)"
@@ -214,3 +216,44 @@ PAPER = Recipe(
 )
 
 RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}
+
+
+_ALONE: Settings = {
+    "agent.lambda_xp": because(0.0, "members differ by their seeds, as in the method without a model"),
+    "agent.sp_from_xp": because(0.0, "there are no cross-play states of their own"),
+    "phase2.episodes_xp": because(0, "nobody is met"),
+}
+"""Later members that learn by self-play alone."""
+
+_UNTIL_TARGET: Settings = {
+    "phase2.first_updates": because(40, "policies of several skills are seen on the way"),
+    "phase2.updates_per_round": 30,
+    "phase2.rounds": because(1, "a member ends at the target, as one on MAPPO does"),
+    "phase2.max_rounds": 24,
+    "phase2.target_score": 10.0,
+}
+"""On the laptop: shorter rounds, and an end at the score that ends the model-free method."""
+
+_TARGETS: Mapping[str, Settings] = {
+    "overcooked/cramped_room": {"phase2.target_score": 10.5},
+    "overcooked/counter_circuit_o_1order": {"phase2.target_score": because(8.0, "the target 10 is not reached")},
+}
+
+
+def _without_partners(own: Settings) -> dict[str, Recipe]:
+    """XPM-WM's recipes for later members that meet nobody."""
+    return {
+        base.name: Recipe(
+            base.name,
+            base.summary,
+            {**_ALONE, **(_UNTIL_TARGET if base is LAPTOP else {}), **own},
+            _TARGETS if base is LAPTOP else {},
+            base=base,
+        )
+        for base in RECIPES.values()
+    }
+
+
+FCP_RECIPES = _without_partners({})
+
+MEP_RECIPES = _without_partners({"agent.surprise": because(0.01, "the paper's alpha")})

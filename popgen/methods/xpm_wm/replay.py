@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.types import Kind, Segment
 
 KIND_CODE = {kind: code for code, kind in enumerate(Kind)}
@@ -316,12 +316,12 @@ class Draws:
     xp: tuple[Request, ...] = ()
 
 
-def model_batch(config: XpmWmRun, member: int) -> Draws:
+def model_batch(config: WorldModelRun, member: int) -> Draws:
     """Windows of one world-model update.
 
     Member 1 learns from everything it has, a share of it from the last rows: a policy finds the rewards that the
     model only imagines, and what it then does in reality must be seen often to be unlearned. Later members mix the
-    kept buffers with their own new data, the latter half self-play and half cross-play.
+    kept buffers with their own new data, the latter half self-play and half cross-play where there is any.
     """
     batch, events = config.world_model.batch, config.replay.event_fraction
     if member == 1:
@@ -329,11 +329,13 @@ def model_batch(config: XpmWmRun, member: int) -> Draws:
         late = (Request(Query(last=config.phase1.recent_rows), recent, events),) if recent else ()
         return Draws(sp=(Request(Query(), batch - recent, events), *late))
     new = int(round(batch * config.phase2.new_fraction))
-    old, old_xp = batch - new, (batch - new) // 4 if member > 2 else 0
+    meets = config.phase2.episodes_xp > 0
+    old, old_xp = batch - new, (batch - new) // 4 if meets and member > 2 else 0
+    new_xp = new // 2 if meets else 0
     kept, own = Query(owner=member, owner_is="below"), Query(owner=member)
     return Draws(
-        sp=(Request(kept, old - old_xp, events), Request(own, new - new // 2, events)),
-        xp=(Request(kept, old_xp, events), Request(own, new // 2, events)),
+        sp=(Request(kept, old - old_xp, events), Request(own, new - new_xp, events)),
+        xp=(Request(kept, old_xp, events), Request(own, new_xp, events)),
     )
 
 
@@ -343,7 +345,7 @@ def major_events(spec: EnvSpec) -> tuple[int, ...]:
     return tuple(i for i, weight in enumerate(spec.event_weights) if weight > median)
 
 
-def start_batch(config: XpmWmRun, spec: EnvSpec, member: int, windows: int) -> Draws:
+def start_batch(config: WorldModelRun, spec: EnvSpec, member: int, windows: int) -> Draws:
     """Windows whose last states become starts of imagination for a later member.
 
     Old states: random play, the moments before a soup is taken or delivered, and late data. New states: this
@@ -354,7 +356,8 @@ def start_batch(config: XpmWmRun, spec: EnvSpec, member: int, windows: int) -> D
     shares = {"random": phase.starts_random, "event": phase.starts_event}
     random, event = (int(round(windows * shares[name])) for name in ("random", "event"))
     late = windows - random - event
-    late_xp = late // 2 if member > 2 else 0
+    meets = phase.episodes_xp > 0
+    late_xp = late // 2 if meets and member > 2 else 0
     return Draws(
         sp=(
             Request(Query(**kept, kind=Kind.RANDOM), random, pool=OLD),
@@ -364,6 +367,6 @@ def start_batch(config: XpmWmRun, spec: EnvSpec, member: int, windows: int) -> D
         ),
         xp=(
             Request(Query(**kept, kind=Kind.XP, recent=LATE), late_xp, pool=OLD),
-            Request(Query(owner=member, kind=Kind.XP), windows // 2, pool=NEW_XP),
+            Request(Query(owner=member, kind=Kind.XP), windows // 2 if meets else 0, pool=NEW_XP),
         ),
     )

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
-from popgen.methods.xpm_wm.config import XpmWmRun
+from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_progress import MemberWeights
 from popgen.methods.xpm_wm.real_play import Tally
@@ -213,7 +213,7 @@ class Setup:
     """
 
     work: Workers
-    config: XpmWmRun
+    config: WorldModelRun
     spec: EnvSpec
     member: int
     seed: int

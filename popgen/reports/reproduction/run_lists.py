@@ -39,12 +39,12 @@ def list_words(
     """
     method = label.partition(":")[0]
     on_rendezvous = environment == RENDEZVOUS
-    agents, each = budget.rendezvous_agents if on_rendezvous else budget.agents, METHODS[method].multiple
-    agents = agents if size is None else size
+    agents = budget.rendezvous_agents if on_rendezvous else budget.agents
+    agents = METHODS[method].fit_size(agents if size is None else size)
     settings = {**find_objective(label), **(changes or {})}
     return [
         *(f"method={method}", f"env={environment}", f"scale={budget.scale}"),
-        f"population.size={-(-agents // each) * each}",
+        f"population.size={agents}",
         *(["run.transport=inline"] if budget.inline and method not in methods_with(NEEDS_RAY) else []),
         *(budget.rendezvous if on_rendezvous else ()),
         *budget.settings,

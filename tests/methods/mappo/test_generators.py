@@ -16,9 +16,9 @@ from popgen.methods.mappo.mep import SurpriseBonus
 from popgen.methods.mappo.needs import check_fcp
 from popgen.methods.mappo.pooling import Plan, gather, pool
 from popgen.methods.mappo.population_bonus import joint_log_probs
-from popgen.methods.mappo.skill_checkpoints import KEPT, SkillCheckpoint, SkillCheckpoints
 from popgen.methods.mappo.trajedi import DivergenceBonus
 from popgen.methods.registry import METHODS
+from popgen.methods.skill_checkpoints import KEPT, SkillCheckpoint, SkillCheckpoints
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
 from popgen.play.trajectories import Trajectories
 from popgen.types import Kind

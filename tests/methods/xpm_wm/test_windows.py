@@ -34,6 +34,17 @@ def test_a_model_batch_is_full_and_mixed_as_asked(member: int, fraction: float) 
         assert sum(r.count for r in draws.xp if r.query.owner_is == "below") == 0
 
 
+@pytest.mark.parametrize("member", [2, 5])
+def test_where_members_meet_nobody_a_batch_is_full_of_self_play(member: int) -> None:
+    config = RunConfig.parse({"agent": {"lambda_xp": 0.0}, "phase2": {"episodes_xp": 0, "new_fraction": 0.25}})
+    draws, batch = model_batch(config, member), config.world_model.batch
+    own = [request.count for request in draws.sp if request.query.owner_is == "equal"]
+    assert sum(request.count for request in draws.sp) == batch and own == [batch // 4]
+    starts = start_batch(config, SPEC, member, 1000)
+    assert sum(request.count for request in starts.sp if request.pool == OLD) == 1000
+    assert not any(request.count for request in (*draws.xp, *starts.xp))
+
+
 def test_soups_are_the_major_events() -> None:
     assert [SPEC.event_names[i] for i in major_events(SPEC)] == ["takes_soup", "delivers_soup"]
     assert major_events(make_env("rendezvous/mppmr").spec) == ()

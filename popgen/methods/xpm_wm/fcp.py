@@ -1,0 +1,58 @@
+"""FCP (Strouse et al. 2021) in a world model: self-play by different seeds, at different skill.
+
+    J(j) = J_SP(j), on trajectories simulated by the world model of member 1
+
+Member 1 and its world model are trained as in XPM-WM. Each later seed then learns in imagination, meets nobody, and
+gives three members, as `method=fcp` does: the policy it started from, that of the round whose real self-play is nearest
+to half of the final one's, and the final one. All of a seed's environment steps are counted for its final member.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from popgen.methods.skill_checkpoints import SKILLS, SkillCheckpoint, SkillCheckpoints
+from popgen.methods.training import TrainedMember
+from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
+from popgen.methods.xpm_wm.member_progress import LaterMemberProgress
+from popgen.methods.xpm_wm.member_training import XpmWmTraining
+from popgen.methods.xpm_wm.train import FIRST
+
+
+class FcpWmTraining(XpmWmTraining):
+    """One seed after the other; see `popgen.methods.training.Training`."""
+
+    def first_of_group(self, member: int) -> int:
+        """The initial member of the seed that `member` is of; member 1 is alone."""
+        return member if member == FIRST else member - (member - FIRST - 1) % len(SKILLS)
+
+    def begin(self, first: int) -> tuple[int, ...]:
+        """A fresh agent, which becomes the final member of its seed; the others are kept on the way."""
+        if first == FIRST:
+            return super().begin(first)
+        final = first + len(SKILLS) - 1
+        super().begin(final)
+        assert isinstance(self.progress, LaterMemberProgress)
+        untrained = self.work.published_form()["acting"]
+        self.progress.skills = SkillCheckpoints([SkillCheckpoint(0, 0.0, untrained)])
+        return tuple(range(first, final + 1))
+
+    def finish_members(self, final: TrainedMember) -> Iterator[TrainedMember]:
+        """The three of this seed."""
+        if final.member != FIRST:
+            yield from self._finish_unskilled(final)
+        final.extra["skill"] = SKILLS[-1]
+        yield final
+
+    def _finish_unskilled(self, final: TrainedMember) -> Iterator[TrainedMember]:
+        """Those before the final one; they leave behind what it does, so that any may be the last of a population."""
+        assert isinstance(self.progress, LaterMemberProgress) and self.progress.skills is not None
+        kept = self.progress.skills
+        chosen = (kept.kept[0], kept.nearest(float(final.extra["sp"]) / 2.0))
+        for number, (skill, checkpoint) in enumerate(zip(SKILLS, chosen, strict=False)):
+            member = final.member - len(SKILLS) + 1 + number
+            policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
+            policy.load(checkpoint.actor)
+            extra = {"skill": skill, "of_member": final.member, "at_steps": checkpoint.steps, "sp": checkpoint.score}
+            note = f"member {member}: {skill} of member {final.member}, {checkpoint.steps:,} steps into its training"
+            yield TrainedMember(member, policy, None, seed=final.seed, extra=extra, left=final.left, note=note)
