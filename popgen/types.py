@@ -36,6 +36,9 @@ RANDOM_MEMBER = 0
 FINAL_SKILL = "final"
 """`extra.skill` of a member whose training went to its end, where others are kept from the way there."""
 
+SKILLS = ("initial", "half", FINAL_SKILL)
+"""Of the members of a seed of FCP, in order."""
+
 BIASED_ROLE, PARTNER_ROLE = "biased", "partner"
 """`extra.role` of the members of pairs: who wants something of its own, and who learned to play beside it."""
 

@@ -6,10 +6,6 @@ from dataclasses import dataclass, field
 
 from popgen.methods.training import State
 from popgen.nets.weights import Weights
-from popgen.types import FINAL_SKILL
-
-SKILLS = ("initial", "half", FINAL_SKILL)
-"""Of the members of a seed of FCP, in order."""
 
 KEPT = 16
 """Candidates for the policies between the first and the last."""

@@ -160,7 +160,7 @@ BOUNDS = {  # accepted, refused
     "agent.return_percentiles": ([[0, 100], [5.0, 95.0]], [[-5, 105], [95, 5], [5, 5], [0, 100.5], [5], [1, 2, 3]]),
     "agent.starts_sp": ([100_000], [10**6]),
     "phase1.envs": ([1, 1024], [10**8]),
-    "phase2.episodes_xp": ([1], [-1, 10**9]),
+    "phase2.episodes_xp": ([1], [0, -1, 10**9]),
     "phase2.cache": ([32], [1, 31]),
     "phase2.starts_random": ([0.0, 0.8], [0.81, 1.0]),
     "phase1.prefill_steps": ([12 * 64], [1, 12 * 64 - 1]),

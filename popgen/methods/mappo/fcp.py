@@ -15,10 +15,11 @@ from popgen.methods.mappo.config import FcpRun
 from popgen.methods.mappo.objective import SELF_PLAY
 from popgen.methods.mappo.train import RllibTraining, refuse_inline
 from popgen.methods.mappo.training_job import policy_config
-from popgen.methods.skill_checkpoints import SKILLS, SkillCheckpoint, SkillCheckpoints
+from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
 from popgen.methods.training import Checkpoint, Loop, State, TrainedMember
 from popgen.methods.transport import Transport
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
+from popgen.types import SKILLS
 
 
 class FcpTraining(RllibTraining):

@@ -33,7 +33,7 @@ from popgen.methods.mappo.recipes import (
     RECIPES,
 )
 from popgen.methods.method import Method
-from popgen.methods.skill_checkpoints import SKILLS
+from popgen.types import SKILLS
 
 MAPPO = Method(
     name="mappo",

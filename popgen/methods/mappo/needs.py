@@ -11,8 +11,7 @@ from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, count_numbers
 from popgen.methods.mappo.config import BaselineRun, BpRun, ComediRun, FcpRun, HspConfig, HspRun, LipoRun, PpoConfig
 from popgen.methods.method import ActorDemand, Needs, ask_for
-from popgen.methods.skill_checkpoints import SKILLS
-from popgen.types import BIASED_ROLE, PARTNER_ROLE
+from popgen.types import BIASED_ROLE, PARTNER_ROLE, SKILLS
 
 
 def list_actors(config: BaselineRun) -> list[ActorDemand]:

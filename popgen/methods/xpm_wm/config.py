@@ -299,7 +299,7 @@ class Phase2Config(Schema):
     """Adam's step size of the world model in phase 2."""
     episodes_sp: Batch = 8
     """Real self-play episodes in a round."""
-    episodes_xp: NonNegative = 8
+    episodes_xp: Annotated[_Int, Field(ge=0, le=100_000)] = 8
     """Real cross-play episodes in a round, over all partners, at least one in each seating with each; 0: members meet
     nobody, which needs `agent.lambda_xp=0`."""
     rounds: Positive = 8

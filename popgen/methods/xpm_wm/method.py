@@ -1,10 +1,10 @@
 """XPM-WM, and what else is trained in its world model, as the rest of the house knows them."""
 
 from popgen.methods.method import Continuation, Method
-from popgen.methods.skill_checkpoints import SKILLS
 from popgen.methods.xpm_wm.config import SHAPES, FcpWmRun, MepWmRun, XpmWmRun
 from popgen.methods.xpm_wm.needs import check_fcp, check_run, estimate_needs, list_actors
 from popgen.methods.xpm_wm.recipes import FCP_RECIPES, MEP_RECIPES, RECIPES
+from popgen.types import SKILLS
 
 POLICIES = {"world_model": "popgen.methods.xpm_wm.actor_critic:WorldModelPolicy"}
 CONTINUATION = Continuation("world_model", SHAPES, ("replay", "capacity"))

@@ -6,8 +6,8 @@ from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, buffer_bytes, count_numbers, observation_entries, segment_bytes
 from popgen.methods.method import ActorDemand, Needs, ask_for
-from popgen.methods.skill_checkpoints import SKILLS
 from popgen.methods.xpm_wm.config import OPEN_LOOP, PREFILL_CHUNK, FcpWmRun, WorldModelRun
+from popgen.types import SKILLS
 
 
 def list_actors(config: WorldModelRun) -> list[ActorDemand]:

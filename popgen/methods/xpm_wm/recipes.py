@@ -234,6 +234,10 @@ _UNTIL_TARGET: Settings = {
 }
 """On the laptop: shorter rounds, and an end at the score that ends the model-free method."""
 
+_SIZED: Mapping[str, Settings] = {
+    "laptop": _UNTIL_TARGET,
+    "demo": {**_UNTIL_TARGET, "phase2.max_rounds": 8, "phase2.target_score": 5.0},
+}
 _TARGETS: Mapping[str, Settings] = {
     "overcooked/cramped_room": {"phase2.target_score": 10.5},
     "overcooked/counter_circuit_o_1order": {"phase2.target_score": because(8.0, "the target 10 is not reached")},
@@ -246,7 +250,7 @@ def _without_partners(own: Settings) -> dict[str, Recipe]:
         base.name: Recipe(
             base.name,
             base.summary,
-            {**_ALONE, **(_UNTIL_TARGET if base is LAPTOP else {}), **own},
+            {**_ALONE, **_SIZED.get(base.name, {}), **own},
             _TARGETS if base is LAPTOP else {},
             base=base,
         )
