@@ -12,10 +12,10 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.methods.transport import Place, Transport, Worker
 from popgen.methods.xpm_wm.config import FcpWmRun, WorldModelRun
-from popgen.methods.xpm_wm.fcp import FcpWmTraining
 from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.real_play import Tally
+from popgen.methods.xpm_wm.skilled_training import FcpWmTraining
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
 from popgen.nets.weights import Weights
 from popgen.play.matches import Match

@@ -41,8 +41,8 @@ from popgen.methods.xpm_wm.imagination import (
     joint_actor,
     start_latents,
 )
+from popgen.methods.xpm_wm.imagined_surprise import surprise_bonus
 from popgen.methods.xpm_wm.latent_filter import Latent
-from popgen.methods.xpm_wm.population_bonus import surprise_bonus
 from popgen.methods.xpm_wm.real_play import Tally
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
@@ -236,24 +236,13 @@ class AgentLearner:
 
     def self_play(self, imagined: Imagined) -> PolicyTarget:
         """+J_SP, which sets the unit of all advantages; with the bonuses, where there are any."""
-        bonuses = self.bonuses(imagined)
+        bonuses = find_bonuses(self, imagined)
         if not bonuses:
             return self_play_target(self.networks, imagined, self.entropy_now())
         paid = replace(imagined, reward=imagined.reward + torch.stack(list(bonuses.values())).sum(0))
         target = self_play_target(self.networks, paid, self.entropy_now())
         figures = {name: float(bonus.mean()) for name, bonus in bonuses.items()}
         return replace(target, figures=target.figures | figures | {"imagined_shaped_sp": float(imagined.reward.mean())})
-
-    def bonuses(self, imagined: Imagined) -> dict[str, Tensor]:
-        """What imagined self-play earns beside the reward, (H, B) by name: for states that were seldom seen, and for
-        what the population seldom does."""
-        found: dict[str, Tensor] = {}
-        if scale := self.discovery.bonus_scale(self.plays):
-            found["count_bonus"] = self.discovery.bonus(self.model, imagined.latent[1:], scale)
-        if self.config.surprise and self.partners:
-            actors = [*self.partners.values(), self.networks.rollout_actor]
-            found["surprise_bonus"] = surprise_bonus(self.config, actors, imagined)
-        return found
 
     def cross_play(self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor) -> PolicyTarget:
         """-lambda_XP J_XP, in self-play's unit; what is earned with the partner is remembered."""
@@ -293,3 +282,15 @@ class AgentLearner:
         self.discovery.load_state(state["discovery"])
         self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
         self.imagined_scores = {int(k): float(v) for k, v in state["imagined_scores"].items()}
+
+
+def find_bonuses(learner: AgentLearner, imagined: Imagined) -> dict[str, Tensor]:
+    """What imagined self-play earns beside the reward, (H, B) by name: for states that were seldom seen, and for what
+    the population seldom does."""
+    found: dict[str, Tensor] = {}
+    if scale := learner.discovery.bonus_scale(learner.plays):
+        found["count_bonus"] = learner.discovery.bonus(learner.model, imagined.latent[1:], scale)
+    if learner.config.surprise and learner.partners:
+        actors = [*learner.partners.values(), learner.networks.rollout_actor]
+        found["surprise_bonus"] = surprise_bonus(learner.config, actors, imagined)
+    return found

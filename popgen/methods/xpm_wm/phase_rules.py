@@ -189,7 +189,8 @@ def choose_first(progress: FirstMemberProgress) -> Candidate:
 
 
 def cross_play_episodes(phase: Phase2Config, partners: int) -> int:
-    """Of one round: at least one in each seating with each partner; none where members meet nobody."""
+    """Of one round: at least one in each seating with each partner, since every partner's cross-play must be known to
+    tell the strongest; none where members meet nobody."""
     return max(phase.episodes_xp, 2 * partners) if phase.episodes_xp else 0
 
 
@@ -225,6 +226,7 @@ def judge_round(
     progress.since_best += 1
     if progress.best is None or candidate.merit(limit) > progress.best.merit(limit):
         progress.best, progress.since_best = candidate, 0
+    progress.keep_skill(candidate)
     progress.rounds += 1
     progress.figures = {
         "real_sp": candidate.sp,

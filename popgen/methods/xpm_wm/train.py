@@ -189,7 +189,6 @@ class LaterMember:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
         self.member, self.archive = setup.member, setup.archive
         self.phase, self.progress, self.tally = self.config.phase2, progress, setup.tally
-        # Every partner's cross-play must be known to tell the strongest, in both seats.
         self.episodes_xp = rules.cross_play_episodes(self.phase, len(self.archive))
         self.pairs = real.seatings(self.member, sorted(self.archive)) if self.episodes_xp else []
         self.most_rounds = rules.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
@@ -244,7 +243,6 @@ class LaterMember:
         progress, watch = self.progress, self.config.watch
         progress.steps += real.steps_of(sampled)
         scored = rules.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
-        progress.keep_skill(scored)
         progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
         trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
         ended = rules.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)

@@ -11,9 +11,9 @@ import torch
 from support.small import AGENT, MODEL, kitchen, random_latent
 
 from popgen.methods.xpm_wm.actor_critic import Actor
-from popgen.methods.xpm_wm.agent import AgentLearner
+from popgen.methods.xpm_wm.agent import AgentLearner, find_bonuses
 from popgen.methods.xpm_wm.imagination import OLD, Imagined, Starts
-from popgen.methods.xpm_wm.population_bonus import joint_log_probs, surprise_bonus
+from popgen.methods.xpm_wm.imagined_surprise import joint_log_probs, surprise_bonus
 from popgen.methods.xpm_wm.world_model import WorldModel
 from popgen.nets import weights as w
 
@@ -92,7 +92,7 @@ def test_a_weight_of_zero_is_self_play_alone_bit_for_bit() -> None:
 def test_without_predecessors_nobody_is_surprised() -> None:
     """Member 1 is trained as in XPM-WM."""
     learner = make_learner((), surprise=0.1)
-    assert learner.bonuses(imagined_play()) == {} and "surprise_bonus" not in learner.update()
+    assert find_bonuses(learner, imagined_play()) == {} and "surprise_bonus" not in learner.update()
 
 
 def test_what_the_predecessors_do_is_done_less() -> None:
