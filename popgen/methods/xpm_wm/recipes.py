@@ -230,6 +230,8 @@ _UNTIL_TARGET: Settings = {
     "phase2.updates_per_round": 30,
     "phase2.rounds": because(1, "a member ends at the target, as one on MAPPO does"),
     "phase2.max_rounds": 24,
+    "phase2.plateau": 0,
+    "phase2.model_lag": because(0, "few short rounds: none is to be lost"),
     "phase2.target_score": 10.0,
 }
 """On the laptop: shorter rounds, and an end at the score that ends the model-free method."""
