@@ -51,7 +51,10 @@ class NearestTargets:
         self._spans = {mark: slice(a, b) for mark, a, b in zip("ODSPX", bounds[:-1], bounds[1:], strict=True)}
         self._distance = np.full((256, len(self._tiles)), FAR, np.int16)
         self._leads = np.zeros((256, len(self._tiles), 4), np.float32)
-        self._faces = np.zeros((256, 4, len(self._tiles)), np.float32)
+        self._faces = np.zeros((256, 4, len(self._tiles)), bool)
+        self._always = np.zeros((len(TARGETS), len(self._tiles)), bool)
+        for number, mark in enumerate("ODS"):
+            self._always[number, self._spans[mark]] = True
         for number, tile in enumerate(self._tiles):
             self._measure(number, tile)
 
@@ -66,7 +69,7 @@ class NearestTargets:
                 distance[cell] = 0
                 front.append(cell)
                 self._leads[cell[1] * width + cell[0], number, direction] = 1.0
-                self._faces[cell[1] * width + cell[0], direction, number] = 1.0
+                self._faces[cell[1] * width + cell[0], direction, number] = True
         while front:
             x, y = front.popleft()
             for dx, dy in DIRECTIONS:
@@ -84,40 +87,27 @@ class NearestTargets:
         """Players' `features` (N, F) uint8 -> (N, self.size) float32, each from the player's own place."""
         states = self._env.features_to_states(obs)
         cell, facing = states[:, 0], states[:, k.ORIENT] & 3
-        rows = np.arange(len(states))
+        present = self._find_present(states)
+        distance = np.where(present, self._distance[cell][:, None], FAR)
+        nearest = distance.argmin(-1)
+        least = np.take_along_axis(distance, nearest[..., None], -1)[..., 0]
+        found = least < FAR
         out = np.zeros((len(states), len(TARGETS), PER_TARGET), np.float32)
-        for number, (span, present) in enumerate(self._present(states)):
-            if present is not None and not present.shape[1]:
-                continue
-            distance = self._distance[:, span][cell]
-            if present is not None:
-                distance = np.where(present, distance, FAR)
-            nearest = distance.argmin(1)
-            found = distance[rows, nearest] < FAR
-            out[:, number, 0] = found
-            out[:, number, 1] = np.where(found, 1.0 / (1.0 + distance[rows, nearest]), 0.0)
-            out[:, number, 2:6] = self._leads[:, span][cell, nearest] * found[:, None]
-            faced = self._faces[:, :, span][cell, facing]
-            out[:, number, 6] = (faced if present is None else faced * present).any(1)
+        out[..., 0] = found
+        out[..., 1] = np.where(found, 1.0 / (1.0 + least), 0.0)
+        out[..., 2:6] = self._leads[cell[:, None], nearest] * found[..., None]
+        out[..., 6] = (present & self._faces[cell, facing][:, None]).any(-1)
         return out.reshape(len(states), -1)
 
-    def _present(self, states: np.ndarray) -> list[tuple[slice, np.ndarray | None]]:
-        """For each of TARGETS the tiles it can be, and where it is (None: everywhere)."""
+    def _find_present(self, states: np.ndarray) -> np.ndarray:
+        """(N, TARGETS, tiles) bool: which tiles each of TARGETS is at."""
         pots = len(self._env.tables.pots)
         contents = states[:, k.POTS : k.POTS + 2 * pots : 2]
         cooking = states[:, k.POTS + 1 : k.POTS + 2 * pots : 2]
         counters = states[:, k.POTS + 2 * pots :]
-        pot, counter = self._spans["P"], self._spans["X"]
-        return [
-            (self._spans["O"], None),
-            (self._spans["D"], None),
-            (self._spans["S"], None),
-            (pot, contents == 0),
-            (pot, (contents != 0) & (cooking == 0)),
-            (pot, cooking > 1),
-            (pot, cooking == 1),
-            (counter, counters == k.ONION),
-            (counter, counters == k.DISH),
-            (counter, counters >= k.FIRST_SOUP),
-            (counter, counters == 0),
-        ]
+        present = np.repeat(self._always[None], len(states), 0)
+        in_pots = (contents == 0, (contents != 0) & (cooking == 0), cooking > 1, cooking == 1)
+        on_counters = (counters == k.ONION, counters == k.DISH, counters >= k.FIRST_SOUP, counters == 0)
+        for number, there in enumerate((*in_pots, *on_counters), start=3):
+            present[:, number, self._spans["P" if number < 7 else "X"]] = there
+        return present
