@@ -5,6 +5,7 @@ Everything is a piece in one folder, shared by all targets, and a finished piece
     OUT/runs/RUN/            a run, finished or with checkpoints to go on from
     OUT/pieces/RUN.json      who made it: command, machine, seconds
     OUT/measured/RUN.MEASURE.json
+    OUT/studies/STUDY/       a simulated study with its records and tables; OUT/studies/people/LAYOUT: clones of people
     OUT/TARGET/              record.json, report.md, rows.csv, chart.png and .svg
 
 Whatever ends the process, the same command goes on with the next piece.
@@ -15,6 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from popgen.config.run_config import RunConfig
@@ -24,11 +26,13 @@ from popgen.jsonable import jsonable
 from popgen.pipelines.reproduction_pieces import Job, Pieces, read_json, write_json
 from popgen.pipelines.run_batch import run_all
 from popgen.pipelines.run_measures import MEASURES, RunToMeasure, describe_seconds, round_figures
+from popgen.pipelines.simulated_study import StudyToSimulate
 from popgen.progress import Reporter
 from popgen.reports.charts.chart_style import Pictures
 from popgen.reports.charts.reproduction_charts import draw_target
 from popgen.reports.method_titles import title_of
 from popgen.reports.reproduction.results_page import FORMAT, VERSION, to_record_text, to_report
+from popgen.reports.reproduction.run_lists import EGO_MARK
 from popgen.reports.reproduction.run_tables import to_rows_csv
 from popgen.reports.reproduction.target_records import Record, Target, WantedRun
 from popgen.reports.run_record import is_finished, read_run
@@ -88,10 +92,27 @@ def _measure_run(pieces: Pieces, job: Job, name: str) -> None:
     holdouts = {one.row: pieces.find_job(one).folder for one in job.wanted.holdouts}
     if missing := [title for title, folder in holdouts.items() if not is_finished(folder)]:
         raise UserError(name, f"needs {missing[0]}", "finish that run first")
-    episodes = pieces.plan.budget.episodes
-    figures = MEASURES[name](RunToMeasure(job.folder, job.wanted.row, episodes, holdouts))
+    episodes, people = pieces.plan.budget.episodes, _gather_study(pieces, job)
+    figures = MEASURES[name](RunToMeasure(job.folder, job.wanted.row, episodes, holdouts, people))
     values = {"run": str(job.folder), "episodes": episodes, "figures": round_figures(jsonable(figures))}
     write_json(pieces.find_measured(job, name), values)
+
+
+def _gather_study(pieces: Pieces, job: Job) -> StudyToSimulate | None:
+    """The study that a job's ego plays in; raises UserError where one of its egos is missing."""
+    if job.people is None:
+        return None
+    egos: dict[str, list[Path]] = {}
+    for ego in job.people.egos:
+        found = pieces.find_job(ego)
+        if not found.done:
+            raise UserError("study", f"needs the ego of {ego.row}, seed {ego.seed}", "finish that run first")
+        egos.setdefault(f"{EGO_MARK}{ego.row}", []).append(found.folder / "population")
+    first = job.people.egos[0].teacher
+    assert first is not None and job.wanted.teacher is not None
+    tutor = pieces.find_job(first).folder / "population"
+    name = f"{EGO_MARK}{job.wanted.teacher.row}"
+    return StudyToSimulate(pieces.plan.out / "studies", name, egos, tutor, job.people.size, job.wanted.seed)
 
 
 def _write_target(pieces: Pieces, target: Target) -> Record:

@@ -12,8 +12,11 @@ from typing import Any
 from popgen.config.run_config import RunConfig
 from popgen.durable_files import replace_file
 from popgen.pipelines.run_batch import named
-from popgen.reports.reproduction.target_records import Budget, Target, WantedRun
+from popgen.reports.reproduction.target_records import Budget, Target, WantedRun, WantedStudy
 from popgen.reports.run_record import differences, is_finished, planned_run, read_run
+
+ALL_LAYOUTS = "overcooked/all layouts"
+"""The environment of what is pooled over layouts."""
 
 MEASURE_SECONDS = 10.0
 """That a measure takes, until one has been made."""
@@ -56,6 +59,7 @@ class Job:
         taken_over: the run is elsewhere.
         measures: of all targets.
         failed: why it is not there, after an attempt.
+        people: the study in which it plays.
     """
 
     wanted: WantedRun
@@ -65,6 +69,7 @@ class Job:
     taken_over: bool = False
     measures: list[str] = field(default_factory=list)
     failed: str = ""
+    people: WantedStudy | None = None
 
     @property
     def done(self) -> bool:
@@ -104,6 +109,7 @@ class Pieces:
             self._keys[run] = str(job.folder)
             self.jobs.setdefault(str(job.folder), job)
         job = self.find_job(run)
+        job.people = job.people or run.people
         job.measures += [name for name in run.measures if name not in job.measures]
         return job
 
@@ -188,7 +194,9 @@ class Pieces:
         return " ".join([f"popgen ego train {teacher}/population", *job.words])
 
     def find_environment(self, run: WantedRun) -> str:
-        """Where it plays: an ego where its teacher does."""
+        """Where it plays: an ego where its teacher does, one beside people in all layouts."""
+        if run.people is not None:
+            return ALL_LAYOUTS
         job = self.find_job(run.teacher or run)
         assert job.config is not None
         return job.config.env.name

@@ -21,10 +21,11 @@ from popgen.evaluation.held_members import hold_members
 from popgen.evaluation.holdout import Casting, evaluate_holdout
 from popgen.evaluation.holdout_players import check_disjoint, open_sides
 from popgen.evaluation.partner_diversity import measure_partners
-from popgen.evaluation.played_games import count_members, count_people
+from popgen.evaluation.played_games import PlayedGame, count_members, count_people
 from popgen.humans.recordings import LAYOUTS, load_games
 from popgen.pipelines.compare import HELD_SEED
 from popgen.pipelines.experiments import describe_population, measure_source, open_sources
+from popgen.pipelines.simulated_study import CONVENTION_SPREAD, StudyToSimulate, play_study
 from popgen.population import load_population
 from popgen.reports.comparison import default_thresholds, quality_costs
 from popgen.reports.holdout_report import to_dict
@@ -41,9 +42,6 @@ GRID = 21
 SHARE = 0.8
 """Of the final score, at which a curve has risen."""
 
-CONVENTION_SPREAD = 0.5
-"""Standard deviations from the mean at which the paper calls a convention high or low."""
-
 
 @dataclass(frozen=True)
 class RunToMeasure:
@@ -54,12 +52,14 @@ class RunToMeasure:
         row: what it is called.
         episodes: of every evaluation.
         holdouts: title -> folder of a run whose population an ego is held against.
+        people: the study in which simulated people play with the ego.
     """
 
     folder: Path
     row: str
     episodes: int
     holdouts: Mapping[str, Path]
+    people: StudyToSimulate | None = None
 
 
 def measure_scores(job: RunToMeasure) -> dict[str, Any]:
@@ -205,15 +205,25 @@ def measure_ego(job: RunToMeasure) -> dict[str, Any]:
 
 
 def measure_conventions(job: RunToMeasure) -> dict[str, Any]:
-    """How members' dishes go with what they do, pooled as in the paper, and how near they come to recorded people."""
+    """How members' dishes go with what they do, pooled as in the paper, and how near they come to recorded people; of
+    an ego, how the dishes of simulated people beside it go with what those do."""
+    if job.people is not None:
+        games = play_study(job.people)
+        mean = float(np.mean([game.dish_rate for game in games]))
+        return {**_list_effects(games), "games": len(games), "dishes": mean}
     games = count_members(load_population(job.folder / "population"), job.episodes, SEED)
     layout = games[0].layout
-    effects = [one for one in tabulate_effects(games, CONVENTION_SPREAD, pooled=True) if "share" not in one.behaviour]
-    found = {f"{one.behaviour} {one.group}": one.effect for one in effects if math.isfinite(one.effect)}
+    found = _list_effects(games)
     if layout not in LAYOUTS:
         return found
     covered = measure_coverage(count_people(load_games(layouts=[layout])), games, seed=SEED)
     return {**found, "nearest": covered.nearest, "shuffled": covered.shuffled, "average": covered.average}
+
+
+def _list_effects(games: Sequence[PlayedGame]) -> dict[str, float]:
+    """The paper's table: `behaviour group` -> effect."""
+    effects = [one for one in tabulate_effects(games, CONVENTION_SPREAD, pooled=True) if "share" not in one.behaviour]
+    return {f"{one.behaviour} {one.group}": one.effect for one in effects if math.isfinite(one.effect)}
 
 
 MEASURES: dict[str, Callable[[RunToMeasure], dict[str, Any]]] = {

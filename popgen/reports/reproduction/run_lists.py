@@ -8,10 +8,13 @@ from typing import Any
 from popgen.methods.registry import METHODS, find_objective, list_objectives, methods_with
 from popgen.reports.method_titles import name_of, title_of
 from popgen.reports.paper_figures import BASELINES, OWN_METHOD, RENDEZVOUS, SIMULATOR_METHOD
-from popgen.reports.reproduction.target_records import Budget, WantedRun
+from popgen.reports.reproduction.target_records import Budget, WantedRun, WantedStudy
 
 EGO = "hipt"
 """The method of the paper's egos."""
+
+EGO_MARK = "E-"
+"""Before the name of the method whose population an ego was trained with, as in the paper."""
 
 MODEL, SIMULATOR = name_of(OWN_METHOD), name_of(SIMULATOR_METHOD)
 COMPARED = (MODEL, SIMULATOR, *(name_of(title) for title in BASELINES))
@@ -115,8 +118,24 @@ def list_times(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
 
 
 def list_conventions(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
-    """How much of what people do the populations cover."""
-    return want_runs(budget, seeds, COMPARED, budget.layouts, ["conventions", SCORES])
+    """How much of what people do the populations cover; and a row for each ego of a simulated study."""
+    populations = want_runs(budget, seeds, COMPARED, budget.layouts, ["conventions", SCORES])
+    return [*populations, *(run for seed in seeds for run in list_study_rows(budget, seed))]
+
+
+def list_study_rows(budget: Budget, seed: int) -> list[WantedRun]:
+    """A row for each method whose population teaches egos: clones of people beside those, in all layouts."""
+    words, found = (f"method={EGO}", f"scale={budget.scale}"), []
+    for name in TEACHERS:
+        teachers = (want_runs(budget, [seed], [name], [layout], [SCORES])[0] for layout in budget.layouts)
+        found.append([WantedRun(teacher.row, words, seed, (), teacher) for teacher in teachers])
+    people = WantedStudy(tuple(ego for egos in found for ego in egos), budget.study)
+    return [
+        WantedRun(
+            f"{EGO_MARK}{egos[0].row}, clones of people", words, seed, ("conventions",), egos[0].teacher, (), people
+        )
+        for egos in found
+    ]
 
 
 def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:

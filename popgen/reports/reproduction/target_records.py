@@ -11,6 +11,25 @@ Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
+class StudyBudget:
+    """How large a simulated study is.
+
+    Attributes:
+        participants: in all; clones of people, or with `random_keys` nobody in particular.
+        pairs: of games in each layout.
+        tutorials: practice games.
+        steps: of a game.
+        random_keys: participants press keys at random.
+    """
+
+    participants: int
+    pairs: int
+    tutorials: int = 3
+    steps: int = 400
+    random_keys: bool = False
+
+
+@dataclass(frozen=True)
 class Budget:
     """How much is spent.
 
@@ -42,6 +61,20 @@ class Budget:
     rendezvous: tuple[str, ...] = ()
     minutes: float = 15.0
     inline: bool = False
+    study: StudyBudget = StudyBudget(participants=40, pairs=2)
+
+
+@dataclass(frozen=True)
+class WantedStudy:
+    """A study with simulated people, one for all its egos.
+
+    Attributes:
+        egos: runs of egos by their rows, in all layouts.
+        size: of the study.
+    """
+
+    egos: tuple[WantedRun, ...]
+    size: StudyBudget
 
 
 @dataclass(frozen=True)
@@ -55,6 +88,7 @@ class WantedRun:
         measures: names of what is measured of it (`popgen.pipelines.run_measures`).
         teacher: the run whose population an ego is trained with; None for a population.
         holdouts: runs whose populations an ego is held against.
+        people: the study in which simulated people play with this row's egos, in all layouts at once.
     """
 
     row: str
@@ -63,11 +97,17 @@ class WantedRun:
     measures: tuple[str, ...]
     teacher: WantedRun | None = None
     holdouts: tuple[WantedRun, ...] = ()
+    people: WantedStudy | None = None
 
     @property
     def needs(self) -> tuple[WantedRun, ...]:
-        """Runs that must be finished before this one is measured."""
-        return (*(() if self.teacher is None else (self.teacher,)), *self.holdouts)
+        """Runs that must be finished before this one is measured, in order."""
+        egos = () if self.people is None else self.people.egos
+        return (
+            *(() if self.teacher is None else (self.teacher,)),
+            *self.holdouts,
+            *(one for ego in egos for one in (*ego.needs, ego)),
+        )
 
 
 @dataclass(frozen=True)

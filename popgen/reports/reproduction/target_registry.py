@@ -7,7 +7,7 @@ from popgen.reports.paper_ego_figures import EGOS
 from popgen.reports.paper_figures import CRAMPED, LAYOUT_NAMES, RENDEZVOUS, RING
 from popgen.reports.reproduction import paper_lines, run_lists
 from popgen.reports.reproduction.paper_lines import ANY_EXIT, AVERAGE, SP, TOTAL, XP
-from popgen.reports.reproduction.target_records import Budget, Column, Target
+from popgen.reports.reproduction.target_records import Budget, Column, StudyBudget, Target
 
 ALL = "all"
 """Name of all targets together."""
@@ -27,6 +27,7 @@ BUDGETS = {
         rendezvous=("xpm_sim.unroll=30",),
         minutes=0.2,
         inline=True,
+        study=StudyBudget(participants=3, pairs=1, tutorials=1, steps=40, random_keys=True),
     ),
     "laptop": Budget(
         "laptop",
@@ -40,6 +41,7 @@ BUDGETS = {
         episodes=20,
         rendezvous=("evaluation.episodes=2", "ppo.max_steps=260000"),
         minutes=10.0,
+        study=StudyBudget(participants=40, pairs=5),  # 23 games in two layouts
     ),
     "paper": Budget(
         "paper",
@@ -221,6 +223,8 @@ TARGETS = {
                     for behaviour in ("plating", "onion picking", "movement")
                     for group in ("high", "low")
                 ),
+                Column("games", "conventions.games", 0),
+                Column("dishes", "conventions.dishes"),
                 Column("nearest", "conventions.nearest"),
                 Column("of the average person", "conventions.average"),
             ),
@@ -228,10 +232,13 @@ TARGETS = {
             ("nearest", "of the average person"),
             paper_lines.list_convention_lines,
             (
-                "The paper's people played with its egos; nobody has played with ours. Ours are members in self-play: "
-                "dishes of the high and of the low group less those of all, pooled as in the paper. Nearest: median "
-                "distance of a recorded person to the nearest member, in people's standard deviations; a population "
-                "covers people only where it is below that of the average person.",
+                "The paper's people played with its egos; no people have played with ours. Rows of a method are its "
+                "members in self-play. Rows of an ego are clones of recorded people (at the smoke budget random keys) "
+                "who took part in the study of docs/study.md with egos of these methods' populations, all layouts at "
+                "once: its recordings, all proven, and Table 3 with sizes and intervals are in OUT/studies. Effects "
+                "are dishes of the high and of the low group less those of all, pooled as in the paper. Nearest: "
+                "median distance of a recorded person to the nearest member, in people's standard deviations; a "
+                "population covers people only where it is below that of the average person.",
             ),
         ),
         Target(
