@@ -19,8 +19,7 @@ from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
 from popgen.methods.ego.partner_source import PartnerSource
 from popgen.methods.ego.train import EgoTraining
 from popgen.methods.ego.workers import Iterations
-from popgen.methods.training import Pending, State
-from popgen.methods.transport import Place, Transport
+from popgen.methods.training import Pending, Place, State, Transport
 from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.population import Population, check_compatible, load_population
@@ -186,7 +185,7 @@ class EgoWorkers:
 
 
 def open_training(config: EgoRun, spec: EnvSpec, attempt: str, transport: Transport) -> EgoTraining:
-    """Start the worker of one attempt; see `popgen.methods.transport.OpenTraining`."""
+    """Start the worker of one attempt; see `popgen.methods.training.OpenTraining`."""
     sources = describe_partners(load_partners(config, spec))
     policy = make_policy(EgoSetup.of_run(config), spec)
     return EgoTraining(config, policy, spec.score_name, attempt, EgoWorkers(config, transport), sources)

@@ -1,4 +1,4 @@
-"""Workers as Ray actors: the same calls as in `popgen.methods.transport`, sent to other processes and machines."""
+"""Workers as Ray actors: the same calls as in `popgen.methods.training`, sent to other processes and machines."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from popgen.actors.actor_setup import options
 from popgen.config.sections import ClusterConfig
-from popgen.methods.training import Pending
-from popgen.methods.transport import Place, Worker
+from popgen.methods.training import Pending, Place, Worker
 
 W = TypeVar("W")
 T = TypeVar("T")

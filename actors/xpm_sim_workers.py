@@ -12,15 +12,14 @@ import numpy as np
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.actors.samplers import start_samplers
 from popgen.envs.contract import EnvSpec
-from popgen.methods.training import Pending, PolicySnapshot, Sampled, Segments, State
-from popgen.methods.transport import Place, Transport
+from popgen.methods.training import Pending, Place, PolicySnapshot, Sampled, Segments, State, Transport
 from popgen.methods.xpm_sim.agent import XpmSimLearner
 from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.restart_check import restart_check
 from popgen.methods.xpm_sim.train import XpmSimTraining
 from popgen.methods.xpm_sim.workers import Learned, RestartCheck
 from popgen.nets.weights import Weights, weights_of
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 
 ENVS = 64
 """Environments from which start states are drawn at once."""
@@ -161,5 +160,5 @@ class XpmSimWorkers:
 
 
 def open_training(config: XpmSimRun, spec: EnvSpec, attempt: str, transport: Transport) -> XpmSimTraining:
-    """Start the workers of one attempt; see `popgen.methods.transport.OpenTraining`."""
+    """Start the workers of one attempt; see `popgen.methods.training.OpenTraining`."""
     return XpmSimTraining(config, spec, attempt, XpmSimWorkers(config, attempt, transport))

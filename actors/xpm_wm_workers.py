@@ -1,27 +1,281 @@
-"""XPM-WM's workers over a transport: samplers, both buffers, the world model's learner and the agent's."""
+"""XPM-WM's workers over a transport: samplers, both buffers, the world model's learner and the agent's.
+
+The actors are thin: every number is made by what they hold.
+"""
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from popgen.actors.actor_setup import build_env, device_of, limit_threads
 from popgen.actors.samplers import start_samplers
-from popgen.actors.xpm_wm_actors import AgentActor, ReplayActor, WorldModelActor
+from popgen.config.sections import EnvConfig
 from popgen.envs.contract import EnvSpec
-from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, Segments, State
-from popgen.methods.transport import Place, Transport, Worker
+from popgen.methods.training import (
+    Checkpoint,
+    Pending,
+    Place,
+    PolicySnapshot,
+    Sampled,
+    Segments,
+    State,
+    Transport,
+    Worker,
+)
+from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import FcpWmRun, WorldModelRun
-from popgen.methods.xpm_wm.imagination import Starts
+from popgen.methods.xpm_wm.imagination import OLD, Starts
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
-from popgen.methods.xpm_wm.real_play import Tally
+from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
+from popgen.methods.xpm_wm.real_play import MemberWeights, Tally, TallyKeeper
+from popgen.methods.xpm_wm.replay import Draws, Query, Replay, Request, Windows, draw, join, model_batch, start_batch
 from popgen.methods.xpm_wm.skilled_training import FcpWmTraining
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
-from popgen.nets.weights import Weights
-from popgen.play.matches import Match
-from popgen.types import Kind
+from popgen.methods.xpm_wm.world_model_learner import ModelLearner
+from popgen.nets.weights import Weights, prefixed, under, weights_of
+from popgen.play.rollout import Match
+from popgen.types import Kind, Segment
 
 BUFFERS = ("replay_sp", "replay_xp")
+CHUNK = 25
+"""Updates whose batches are drawn in one call."""
+
+
+class ReplayActor:
+    """Takes segments once each, serves encoded windows, and tells what it has taken in.
+
+    Args:
+        counted: view whose players' own states are counted; "" for none.
+    """
+
+    def __init__(self, env: EnvConfig, capacity: int, seed: int, counted: str = "") -> None:
+        self.replay = Replay(build_env(env, 1), capacity, seed)
+        self.keeper = TallyKeeper(self.replay.env, counted)
+        self.seen: set[tuple[str, int]] = set()
+        self.turn = 0
+
+    def ingest(self, segments: Pending[list[Segment]], owner: int) -> int:
+        """Store segments; a retried call adds nothing. Returns the rows held."""
+        for segment in segments.result():
+            key = (segment.sampler, segment.sequence)
+            if key not in self.seen:
+                self.seen.add(key)
+                self.replay.add(segment, owner)
+                self.keeper.add(segment, owner)
+        return self.replay.size
+
+    def draw(self, requests: tuple[Request, ...], length: int, view: str, repeats: int) -> list[list[Windows | None]]:
+        """For each of `repeats` updates, the windows of every request (None where nothing matches)."""
+        drawn = []
+        for _ in range(repeats):
+            drawn.append([draw(self.replay, request, length, view, self.turn) for request in requests])
+            self.turn += 1
+        return drawn
+
+    def tally(self, owner: int) -> Tally:
+        """Of all segments so far, with `owner` as the present member."""
+        return self.keeper.tally(owner)
+
+    def state(self) -> dict[str, Any]:
+        """Contents, counters and generator."""
+        seen = sorted([list(key) for key in self.seen])
+        return {"replay": self.replay.state(), "seen": seen, "turn": self.turn, "tally": self.keeper.state()}
+
+    def marks(self) -> dict[str, Any]:
+        """What `state` holds beside the contents: small enough for every iteration."""
+        return {"rng": self.replay.rng.bit_generator.state, "turn": self.turn}
+
+    def load_marks(self, marks: dict[str, Any]) -> None:
+        """Draw on from `marks()`, with contents that were added again."""
+        self.replay.rng.bit_generator.state = marks["rng"]
+        self.turn = int(marks["turn"])
+
+    def load_state(self, state: Pending[dict[str, Any]]) -> None:
+        """Continue from `state()`."""
+        contents = state.result()
+        self.replay.load_state(contents["replay"])
+        self.seen = {(str(name), int(number)) for name, number in contents["seen"]}
+        self.turn = int(contents["turn"])
+        self.keeper.load_state(contents["tally"])
+
+
+class WorldModelActor:
+    """Thin: every number is made by `ModelLearner`."""
+
+    def __init__(
+        self,
+        config: WorldModelRun,
+        seed: int,
+        threads: int,
+        replays: tuple[Worker[ReplayActor], Worker[ReplayActor]],
+        transport: Transport,
+    ) -> None:
+        limit_threads(threads)
+        self.config, self.replays, self.transport = config, replays, transport
+        self.spec = build_env(config.env, 1).spec
+        self.learner = ModelLearner(config.world_model, self.spec, seed, device_of(config.cluster.model_gpus))
+        self.member = 1
+        self.biased = False
+
+    def begin_member(self, member: int, archive: dict[int, Weights]) -> None:
+        """Fine-tune for a later member beside the archived filters of those before (acting weights by member)."""
+        self.member = member
+        if member > 1:
+            self.learner.set_learning_rate(self.config.phase2.model_lr)
+        for predecessor in sorted(set(archive) - set(self.learner.predecessors)):
+            self.learner.add_predecessor(predecessor, under("filter", archive[predecessor]))
+
+    def _draw_windows(self, draws: Draws, length: int, repeats: int) -> list[list[Windows | None]]:
+        view = self.config.world_model.view
+        pending = [
+            replay.ask(ReplayActor.draw, requests, length, view, repeats)
+            for replay, requests in zip(self.replays, (draws.sp, draws.xp), strict=True)
+        ]
+        sp, xp = (one.result() for one in pending)
+        return [a + b for a, b in zip(sp, xp, strict=True)]
+
+    def train(self, task: ModelTask) -> ModelUpdate:
+        """Gradient steps; weights, start states from the training windows and mean metrics. Weights and states stay in
+        the store."""
+        began, began_cpu = time.perf_counter(), time.process_time()
+        config, learner, updates = self.config.world_model, self.learner, task.updates
+        totals: dict[str, list[float]] = defaultdict(list)
+        starts: list[Starts] = []
+        for first in range(0, updates, CHUNK):
+            chunk = self._draw_windows(
+                model_batch(self.config, self.member), config.length, min(CHUNK, updates - first)
+            )
+            for parts in chunk:
+                windows = join([part for part in parts if part is not None])
+                if not self.biased:
+                    learner.set_biases(windows)
+                    self.biased = True
+                metrics, seen = learner.update(windows)
+                for name, value in metrics.items():
+                    totals[name].append(value)
+                if count := task.starts_per_update:
+                    starts.append(learner.starts(seen, windows, count, pool=OLD, chosen=task.chosen, rare=task.rare))
+        recent = self._recent_starts(task.recent_rows)
+        means = {name: float(np.mean(values)) for name, values in totals.items()}
+        means["seconds"] = time.perf_counter() - began
+        means["cpu_seconds"] = time.process_time() - began_cpu
+        means["update_ms"] = 1000.0 * means["seconds"] / max(1, updates)
+        stored = self.transport.put(Starts.concat(starts)) if starts else None
+        return ModelUpdate(self.weights(), stored, means, recent)
+
+    def _recent_starts(self, rows: int) -> Pending[Starts] | None:
+        """Start states of the last so many rows of this member's self-play, none of them chosen; None where there are
+        none."""
+        if not rows:
+            return None
+        length, count = self.config.world_model.length, self.config.discovery.trust_starts
+        per_window = max(1, length // 2)
+        query = Query(owner=self.member, kind=Kind.SP, last=rows)
+        part = self._draw_windows(Draws(sp=(Request(query, -(-count // per_window)),)), length, 1)[0][0]
+        if part is None:
+            return None
+        seen = self.learner.posteriors(part)
+        return self.transport.put(self.learner.starts(seen, part, count, pool=OLD, skip=length - per_window))
+
+    def cache_starts(self) -> Starts:
+        """A later member's start states, seen through the present world model."""
+        length = self.config.world_model.length
+        per_window = max(1, length // 2)
+        draws = start_batch(self.config, self.spec, self.member, self.config.phase2.cache // per_window)
+        parts = self._draw_windows(draws, length, 1)[0]
+        starts = []
+        for request, part in zip((*draws.sp, *draws.xp), parts, strict=True):
+            if part is not None:
+                seen = self.learner.posteriors(part)
+                count = per_window * len(part.partner)
+                starts.append(self.learner.starts(seen, part, count, pool=request.pool, skip=length - per_window))
+        return Starts.concat(starts)
+
+    def report(self) -> dict[str, float]:
+        """Event precision and recall at one step and open loop, exact observations: on fresh windows."""
+        length = self.config.world_model.length
+        parts = self._draw_windows(model_batch(self.config, self.member), length + OPEN_LOOP, 4)
+        windows = join([part for update in parts for part in update if part is not None])
+        return model_report(self.learner, windows, context=length)
+
+    def weights(self) -> Pending[Weights]:
+        """The whole world model, in the store."""
+        return self.transport.put(weights_of(self.learner.model))
+
+    def state(self) -> dict[str, Any]:
+        """Learner state."""
+        return {"learner": self.learner.state(), "biased": self.biased}
+
+    def load_state(self, state: Pending[dict[str, Any]]) -> None:
+        """Continue from `state()`."""
+        contents = state.result()
+        self.learner.load_state(contents["learner"])
+        self.biased = bool(contents["biased"])
+
+
+class AgentActor:
+    """Thin: every number is made by `AgentLearner`."""
+
+    def __init__(self, config: WorldModelRun, threads: int, transport: Transport) -> None:
+        limit_threads(threads)
+        self.config, self.transport = config, transport
+        self.spec = build_env(config.env, 1).spec
+        self.learner = self._fresh_learner(1, 0)
+
+    def _fresh_learner(self, member: int, seed: int) -> AgentLearner:
+        config, device = self.config, device_of(self.config.cluster.agent_gpus)
+        return AgentLearner(config.agent, config.world_model, self.spec, member, seed, device, config.discovery)
+
+    def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
+        """A fresh actor and critics beside frozen predecessors (acting weights by member)."""
+        self.learner = self._fresh_learner(member, seed)
+        for partner, weights in partners.items():
+            self.learner.add_partner(partner, under("actor", weights))
+
+    def restart(self, seed: int) -> None:
+        """Fresh actor and critics on the same world model."""
+        self.learner.restart(seed)
+
+    def train(self, task: AgentTask) -> AgentUpdate:
+        """Imagine and update; what comes of it stays in the store."""
+        began, began_cpu = time.perf_counter(), time.process_time()
+        model = task.model.result()
+        self.learner.set_model(model)
+        self.learner.set_starts(task.starts.result(), task.new_share)
+        self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
+        self.learner.constraint.multipliers = dict(task.multipliers)
+        rates: dict[str, float] = {}
+        if task.tally is not None:
+            recent = None if task.recent is None else task.recent.result()
+            rates = self.learner.compare_with_real_play(task.tally, recent)
+        totals: dict[str, list[float]] = defaultdict(list)
+        for _ in range(task.updates):
+            for name, value in self.learner.update().items():
+                totals[name].append(value)
+        means = {name: float(np.mean(values)) for name, values in totals.items()} | rates
+        means["seconds"] = time.perf_counter() - began
+        means["cpu_seconds"] = time.process_time() - began_cpu
+        means["update_ms"] = 1000.0 * means["seconds"] / task.updates
+        acting, critics = self.acting_weights(model), weights_of(self.learner.critics)
+        return AgentUpdate(MemberWeights(self.transport.put(acting), self.transport.put(critics), task.model), means)
+
+    def acting_weights(self, model: Weights) -> Weights:
+        """Policy weights: the filter of `model` and this member's actor."""
+        return prefixed("filter", under("filter", model)) | prefixed("actor", self.learner.actor_weights())
+
+    def state(self) -> dict[str, Any]:
+        """Of the learner: everything but the world model and the start states, which come with every task."""
+        return self.learner.state()
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`, after `begin_member` with the same partners."""
+        self.learner.load_state(state)
 
 
 def wait_for_all(pending: Iterable[Pending[Any]]) -> None:
@@ -196,7 +450,7 @@ class XpmWmWorkers:
 
 
 def open_training(config: WorldModelRun, spec: EnvSpec, attempt: str, transport: Transport) -> XpmWmTraining:
-    """Start the workers of one attempt; see `popgen.methods.transport.OpenTraining`."""
+    """Start the workers of one attempt; see `popgen.methods.training.OpenTraining`."""
     return XpmWmTraining(config, spec, XpmWmWorkers(config, attempt, transport))
 
 

@@ -19,8 +19,7 @@ from popgen.methods.xpm_wm.imagination import OLD
 from popgen.methods.xpm_wm.replay import Query, Replay, Windows
 from popgen.methods.xpm_wm.world_model_learner import ModelLearner
 from popgen.nets.weights import weights_of
-from popgen.play.matches import Match
-from popgen.play.rollout import Sampler
+from popgen.play.rollout import Match, Sampler
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
 

@@ -14,7 +14,6 @@ import ray
 from ray.exceptions import RayError
 
 from popgen.actors.actor_setup import build_env, limit_threads
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.actors.local_ray import start_ray
 from popgen.actors.ray_transport import RayTransport
 from popgen.actors.tracker_actor import RemoteTracker
@@ -24,8 +23,7 @@ from popgen.errors import UserError
 from popgen.evaluation.crossplay import CrossPlayResult, evaluate_population
 from popgen.evaluation.weak_members import WeakMember, find_weak_members
 from popgen.methods.registry import METHODS
-from popgen.methods.training import Training
-from popgen.methods.transport import InlineTransport, Transport
+from popgen.methods.training import InlineTransport, Training, Transport
 from popgen.pages.report_source import read_source
 from popgen.pages.run_report import list_findings, write_run_report
 from popgen.pipelines.training_driver import TrainingDriver
@@ -36,12 +34,12 @@ from popgen.reports.method_titles import title_of
 from popgen.reports.run_description import describe_experiment, describe_run
 from popgen.reports.run_figures import write_run_figures
 from popgen.runs.chart_trackers import FOLDER, OFFLINE, TensorboardTracker, WandbTracker
+from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.directory import RunState, named, run_folder
 from popgen.runs.mlflow_tracker import LocalTracker, address_in_mlflow, choose_store
-from popgen.runs.monitoring import LoggingReporter, gauge
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import RetryBudget, actor_failure, first_line, nodes_alive, user_facing_error, wait_for_room
-from popgen.runs.sinks import NoTracker, TrackerClient
+from popgen.runs.sinks import LoggingReporter, NoTracker, TrackerClient, gauge
 from popgen.runs.storage import Mirror
 from popgen.types import FINAL_SKILL
 

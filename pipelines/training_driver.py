@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.config.run_config import RunConfig
 from popgen.methods.training import (
     Checkpoint,
@@ -29,7 +28,7 @@ from popgen.methods.training import (
 )
 from popgen.population import load_population
 from popgen.progress import Reporter
-from popgen.runs.checkpoints import fitting, member_folder
+from popgen.runs.checkpoints import CheckpointFiles, fitting, member_folder
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import wait_for_room
 

@@ -28,7 +28,7 @@ ORDER = (
 )
 UPWARD: set[tuple[str, str]] = set()
 OWNERS = {  # outside package -> folders and files where it may be imported
-    "ray": ("actors", "pipelines", "popgen/methods/mappo", "popgen/runs/recovery.py", "popgen/runs/monitoring.py"),
+    "ray": ("actors", "pipelines", "popgen/methods/mappo", "popgen/runs/recovery.py", "popgen/runs/sinks.py"),
     "hydra": ("popgen/cli/compose.py",),
     "omegaconf": ("popgen/cli/compose.py",),
     "mlflow": ("popgen/runs/mlflow_tracker.py",),

@@ -19,9 +19,8 @@ import numpy as np
 
 from popgen.envs.contract import BatchedEnv
 from popgen.evaluation.estimates import Estimate
-from popgen.play.matches import Seating
 from popgen.play.policy import Policy, Remembering
-from popgen.play.rollout import advance
+from popgen.play.rollout import Seating, advance
 
 MAX_ENVS = 4096
 """Episodes that are played side by side."""

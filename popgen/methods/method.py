@@ -12,7 +12,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.recipe import Recipe, Settings
 
 if TYPE_CHECKING:
-    from popgen.methods.transport import OpenTraining
+    from popgen.methods.training import OpenTraining
 
 
 @dataclass(frozen=True)

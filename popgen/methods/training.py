@@ -1,4 +1,4 @@
-"""The contract between training loops and operations.
+"""The contract between training loops, their workers and operations.
 
 A training loop is a generator of records: what it does next (`Phase`), what happened (`Progress`, `Round`), what came
 of it (`TrainedMember`). It writes no file, counts no step in a ledger and prints nothing. One driver for all methods
@@ -12,14 +12,20 @@ was not at rest: the loop then comes to rest soon and yields a `Round` that is.
     training.restore(checkpoint)                  # only where there is one of these members
     for record in training.train(): ...           # ends with a `TrainedMember` for each of `members`
     training.close()
+
+A loop's workers are plain objects. A transport makes them, in this process (here) or as Ray actors
+(`popgen.actors.ray_transport`), and hands on what they are asked; every answer is a handle. Handles may be arguments
+and parts of answers: whoever needs the value calls `result`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Concatenate, Generic, NamedTuple, ParamSpec, Protocol, TypeVar
 
+from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.policy import Policy
@@ -37,13 +43,17 @@ def named_figures(learner: str, metrics: Figures) -> dict[str, float]:
     return {f"{learner}/{name}": value for name, value in metrics.items()}
 
 
-T = TypeVar("T", covariant=True)
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+W = TypeVar("W")
+W_co = TypeVar("W_co", covariant=True)
+P = ParamSpec("P")
 
 
-class Pending(Protocol[T]):
+class Pending(Protocol[T_co]):
     """A handle of work that may still be going on: in this process or elsewhere."""
 
-    def result(self) -> T:
+    def result(self) -> T_co:
         """Wait for it; raises what the work raised."""
         ...
 
@@ -308,3 +318,100 @@ class Training(Protocol):
 
     def close(self) -> None:
         """End all workers."""
+
+
+# ---- how workers are reached -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a worker runs: processor cores and cards that it asks for; `with_driver` on the driver's node."""
+
+    cpus: float = 0.0
+    gpus: float = 0.0
+    with_driver: bool = False
+
+
+class Worker(Protocol[W_co]):
+    """A worker of class W, wherever it is."""
+
+    def ask(self, method: Callable[Concatenate[W_co, P], T], *arguments: P.args, **named: P.kwargs) -> Pending[T]:
+        """Have it do `method`, one call after the other in the order of asking."""
+        ...
+
+    def end(self) -> None:
+        """End it, whatever it is doing."""
+
+
+class Transport(Protocol):
+    """Makes workers and handles."""
+
+    def start(self, kind: Callable[P, W], place: Place, *arguments: P.args, **named: P.kwargs) -> Worker[W]:
+        """A worker of class `kind`."""
+        ...
+
+    def put(self, value: T) -> Pending[T]:
+        """A handle of a value that is there."""
+        ...
+
+    def wait(self, pending: Sequence[Pending[Any]], timeout: float | None = None) -> list[Pending[Any]]:
+        """Those whose results are there: at least one, or after `timeout` seconds perhaps none."""
+        ...
+
+
+class OpenTraining(Protocol):
+    """What a method gives: the start of its workers.
+
+    Args:
+        config: of the run.
+        spec: of its environment.
+        attempt: unique to the run's attempt; part of the samplers' names in the ledger.
+        transport: where the workers are.
+    """
+
+    def __call__(self, config: RunConfig, spec: EnvSpec, attempt: str, transport: Transport) -> Training: ...
+
+
+# ---- in this process -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ready(Generic[T]):
+    """A handle of a value that is there."""
+
+    value: T
+
+    def result(self) -> T:
+        """The value."""
+        return self.value
+
+
+@dataclass(frozen=True)
+class InlineWorker(Generic[W]):
+    """An object of this process: asked, it works at once."""
+
+    worker: W
+
+    def ask(self, method: Callable[Concatenate[W, P], T], *arguments: P.args, **named: P.kwargs) -> Pending[T]:
+        """Call the method."""
+        return Ready(getattr(self.worker, method.__name__)(*arguments, **named))
+
+    def end(self) -> None:
+        """It ends with the last reference to it."""
+
+
+@dataclass(frozen=True)
+class InlineTransport:
+    """Everything in this process, one task after the other: for a notebook, a debugger, a test."""
+
+    def start(self, kind: Callable[P, W], place: Place, *arguments: P.args, **named: P.kwargs) -> Worker[W]:
+        """A new object."""
+        return InlineWorker(kind(*arguments, **named))
+
+    def put(self, value: T) -> Pending[T]:
+        """The value itself, behind a handle."""
+        return Ready(value)
+
+    def wait(self, pending: Sequence[Pending[Any]], timeout: float | None = None) -> list[Pending[Any]]:
+        """All: nothing is ever waited for."""
+        return list(pending)

@@ -1,4 +1,4 @@
-"""Building blocks of networks: layers, the layer-normalised GRU cell, convolutions, two-hot heads, draws of actions."""
+"""Building blocks of networks: layers, convolutions, draws of actions."""
 
 from __future__ import annotations
 
@@ -45,23 +45,6 @@ def mlp(
     if outputs is not None:
         parts.append(linear(units if layers else inputs, outputs, scale=output_scale))
     return nn.Sequential(*parts)
-
-
-class NormGRUCell(nn.Module):
-    """GRU cell with one layer norm over its three gates (DreamerV2/V3); starts out slow to forget."""
-
-    def __init__(self, inputs: int, units: int) -> None:
-        super().__init__()
-        self.units = units
-        self.gates = linear(inputs + units, 3 * units)
-        self.norm = nn.LayerNorm(3 * units, eps=1e-3)
-
-    def forward(self, inputs: Tensor, hidden: Tensor) -> Tensor:
-        """inputs (B, I), hidden (B, D) -> (B, D)."""
-        reset, candidate, update = self.norm(self.gates(torch.cat([inputs, hidden], -1))).chunk(3, -1)
-        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        update = torch.sigmoid(update - 1.0)
-        return hidden + update * (candidate - hidden)
 
 
 def _make_convolution(
@@ -141,40 +124,6 @@ class ConvDecoder(nn.Module):
         return self.layers(grid).permute(0, 2, 3, 1) + self.bias
 
 
-# ---- two-hot heads ---------------------------------------------------------------------------------------------------
-
-
-class TwoHot(nn.Module):
-    """Bins at symexp of an even grid over [-limit, limit]; exactly antisymmetric, so flat logits mean 0.
-
-    An odd number of bins keeps one at 0. `limit` is in symlog units: 7 covers returns of about +-1,100.
-    """
-
-    bins: Tensor
-
-    def __init__(self, bins: int, limit: float = 7.0) -> None:
-        super().__init__()
-        half = torch.expm1(torch.linspace(0.0, limit, bins // 2 + 1))[1:]
-        middle = torch.zeros(bins % 2)
-        self.register_buffer("bins", torch.cat([-half.flip(0), middle, half]), persistent=False)
-
-    def mean(self, logits: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
-        """The expected value."""
-        return (torch.softmax(logits.float(), -1) * self.bins).sum(-1)
-
-    def loss(self, logits: Float[Tensor, "*batch K"], target: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Cross-entropy (...) of the two-hot encoding of `target` (...) under logits (..., K)."""
-        bins = self.bins
-        target = target.detach().clamp(float(bins[0]), float(bins[-1])).contiguous()
-        above = torch.searchsorted(bins, target).clamp(1, len(bins) - 1)
-        low, high = bins[above - 1], bins[above]
-        weight = (target - low) / (high - low)
-        log_probs = torch.log_softmax(logits, -1)
-        below_log = log_probs.gather(-1, (above - 1).unsqueeze(-1)).squeeze(-1)
-        above_log = log_probs.gather(-1, above.unsqueeze(-1)).squeeze(-1)
-        return -((1.0 - weight) * below_log + weight * above_log)
-
-
 # ---- draws of actions ------------------------------------------------------------------------------------------------
 
 
@@ -183,16 +132,6 @@ class DrawnActions(NamedTuple):
 
     action: Tensor
     log_prob: Tensor
-
-
-def draw_by_inversion(
-    log_probs: Float[Tensor, "*batch A"], generator: torch.Generator | None = None
-) -> Int[Tensor, "*batch"]:
-    """By inverting the cumulative distribution: one uniform number an action, the fewest draws; for imagination."""
-    cumulative = log_probs.exp().cumsum(-1)
-    uniform = torch.rand(cumulative.shape[:-1], generator=generator, device=cumulative.device)
-    actions = (cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
-    return actions.clamp(max=cumulative.shape[-1] - 1)
 
 
 def draw_by_gumbel(logits: Float[Tensor, "*batch A"], generator: torch.Generator) -> DrawnActions:

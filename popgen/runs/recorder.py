@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import shutil
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -22,7 +24,6 @@ from popgen.population import PopulationWriter, load_population
 from popgen.population.manifest import MemberInfo
 from popgen.runs.directory import RunState, describe_end, named, run_folder
 from popgen.runs.ledger import Ledger
-from popgen.runs.monitoring import DiskWatch, RunLog
 from popgen.runs.provenance import note_attempt
 from popgen.runs.sinks import (
     CheckpointWritten,
@@ -33,6 +34,7 @@ from popgen.runs.sinks import (
     MetricsSink,
     MlflowSink,
     NoTracker,
+    RunLog,
     RunLogSink,
     Sink,
     StorageSink,
@@ -240,6 +242,35 @@ class RunRecorder:
     def _log_end(self, status: str, error: BaseException | None) -> None:
         text = None if error is None else describe_end(error)
         self.events.write("end", level="INFO" if error is None else "ERROR", status=status, error=text)
+
+
+class DiskWatch:
+    """Stops a run in one line before the disk is full, so that its last checkpoint stays whole.
+
+    Args:
+        folder: the run's.
+        reserve: bytes that must stay free.
+        every: seconds between two looks.
+    """
+
+    def __init__(self, folder: Path, reserve: int, every: float = 1.0) -> None:
+        self.folder, self.reserve, self.every = folder, reserve, every
+        self._last = -math.inf
+
+    def look(self) -> int | None:
+        """Bytes that are free, None where it is too early to look again.
+
+        Raises:
+            UserError: they are fewer than the reserve.
+        """
+        if time.monotonic() - self._last < self.every:
+            return None
+        self._last = time.monotonic()
+        free = shutil.disk_usage(self.folder).free
+        if free < self.reserve:
+            problem = f"{self.folder} has {free / 2**20:,.0f} MiB left, fewer than run.disk_reserve"
+            raise UserError("run.root", problem, "make room and give the same run.id again: it goes on from there")
+        return free
 
 
 def _count_kinds(population: Path, ledger: Ledger) -> dict[str, int]:

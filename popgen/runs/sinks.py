@@ -1,25 +1,27 @@
-"""Where a run's records go: what the recorder tells its sinks, and one sink each for ledger, metrics, MLflow, gauges,
-run log and storage copy. A sink overrides what it wants to know; each can be left out."""
+"""Where a run's records go: what the recorder tells its sinks, and one sink each for ledger, metrics, MLflow, gauges of
+Prometheus, run log and storage copy. A sink overrides what it wants to know; each can be left out."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from popgen.durable_files import read_regular, replace_file
 from popgen.errors import UserError
+from popgen.progress import Figure, Reporter
 from popgen.runs.ledger import Ledger
 from popgen.runs.storage import Mirror
 from popgen.types import Kind, LedgerEntry
 
-if TYPE_CHECKING:
-    from popgen.runs.monitoring import RunLog
+LOG = "run.log"
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def _round_figure(value: float) -> float | None:
 
 
 class TrackerClient(Protocol):
-    """The recorder's end of a tracker, see `popgen.runs.mlflow_tracker.Tracker`."""
+    """The recorder's end of a tracker, see `popgen.runs.mlflow_tracker.Tracker`. Each method does nothing by itself."""
 
     def start(self, resume: Mapping[str, Any] | None = None) -> None:
         """Open the store; `resume` is what `flush` gave in an earlier attempt."""
@@ -139,39 +141,14 @@ class TrackerClient(Protocol):
 
     def flush(self) -> dict[str, Any]:
         """Wait until everything is written; what a later tracker needs to continue."""
-        ...
+        return {}
 
     def finish(self, status: str) -> None:
         """End all MLflow runs."""
 
 
-class NoTracker:
-    """A run without MLflow."""
-
-    def start(self, resume: Mapping[str, Any] | None = None) -> None:
-        """There is no store to open."""
-
-    def forget(self) -> None:
-        """There is no process."""
-
-    def log(self, metrics: Mapping[str, float], step: int, member: int | None = None) -> None:
-        """Ignore metrics."""
-
-    def log_scaling(self, members: int, environment_steps: int, kinds: Mapping[str, int] | None = None) -> None:
-        """Ignore the figures."""
-
-    def describe(self, text: str, overview: str = "") -> None:
-        """Ignore the text."""
-
-    def log_artifact(self, path: str | Path, folder: str | None = None) -> None:
-        """Ignore the file."""
-
-    def flush(self) -> dict[str, Any]:
-        """There are no MLflow runs."""
-        return {}
-
-    def finish(self, status: str) -> None:
-        """There is nothing to end."""
+class NoTracker(TrackerClient):
+    """A run without MLflow: nothing is kept."""
 
 
 class MlflowSink(Sink):
@@ -219,39 +196,135 @@ class MlflowSink(Sink):
         return text
 
 
+GAUGES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "popgen_environment_steps": ("Environment steps in the ledger.", ("run", "kind")),
+    "popgen_members": ("Members in the population.", ("run",)),
+    "popgen_iteration": ("Iterations of the member in training.", ("run", "member")),
+    "popgen_score": ("Mean score of the latest self-play episodes.", ("run", "member")),
+    "popgen_update_milliseconds": ("Mean time of one update of a learner.", ("run", "learner")),
+    "popgen_learner_idle_share": ("Share of the time in which a learner had nothing to do.", ("run", "learner")),
+    "popgen_staleness_rounds": ("Rounds by which the inputs of a task were out of date at its end.", ("run", "work")),
+    "popgen_queue_rounds": ("Rounds that a kind of work is ahead of the slowest.", ("run", "work")),
+    "popgen_restarts": ("Times that the run went on after the death of an actor or node.", ("run",)),
+    "popgen_disk_free_bytes": ("Room left where the run's folder is.", ("run",)),
+}
+"""Name -> (description, tags). Ray serves them, `ray_` before each name, at every node's metrics port."""
+
+FIGURES = {
+    "real_sp": ("popgen_score", "member"),
+    "score": ("popgen_score", "member"),
+    "update_ms": ("popgen_update_milliseconds", "learner"),
+    "idle": ("popgen_learner_idle_share", "learner"),
+    "staleness": ("popgen_staleness_rounds", "work"),
+    "queue": ("popgen_queue_rounds", "work"),
+}
+"""Figures of `RunRecorder.log` that are gauges: NAME of a member, NAME/WORK or LEARNER/NAME -> (gauge, tag)."""
+
+_gauges: dict[str, Any] = {}
+
+
+def gauge(name: str, value: float, **tags: str) -> None:
+    """Set one of `GAUGES`; nothing happens without Ray, which a command without a run does not load."""
+    ray = sys.modules.get("ray")
+    if ray is None or not ray.is_initialized() or not math.isfinite(value):
+        return
+    if name not in _gauges:
+        from ray.util.metrics import Gauge
+
+        description, keys = GAUGES[name]
+        _gauges[name] = Gauge(name, description=description, tag_keys=keys)
+    _gauges[name].set(float(value), tags=tags)
+
+
+def show_figures(run: str, member: int, figures: Mapping[str, float]) -> None:
+    """Set the gauges that `figures` of a member have."""
+    for name, value in figures.items():
+        first, _, last = name.partition("/")
+        known, of = (first, last) if first in FIGURES else (last or first, first)
+        if known in FIGURES:
+            wanted, tag = FIGURES[known]
+            gauge(wanted, value, run=run, **{tag: str(member) if tag == "member" else of})
+
+
 class GaugeSink(Sink):
-    """Sets the gauges that `popgen.runs.monitoring.GAUGES` lists."""
+    """Sets the gauges that `GAUGES` lists."""
 
     def __init__(self, run: str, ledger: Ledger) -> None:
         self.run, self.ledger = run, ledger
 
     def on_entries(self, entries: Sequence[LedgerEntry]) -> None:
         """Totals by kind."""
-        from popgen.runs.monitoring import gauge  # it needs Ray, which a command without a run does not load
-
         for kind in Kind:
             if steps := self.ledger.steps(kind=kind):
                 gauge("popgen_environment_steps", steps, run=self.run, kind=str(kind))
 
     def on_metrics(self, point: MetricPoint) -> None:
         """The member's score, the learners' speed, room on the disk."""
-        from popgen.runs.monitoring import gauge, show_figures
-
         if point.free_bytes is not None:
             gauge("popgen_disk_free_bytes", point.free_bytes, run=self.run)
         show_figures(self.run, point.member, point.figures)
 
     def on_checkpoint(self, checkpoint: CheckpointWritten) -> None:
         """Iterations of the member in training."""
-        from popgen.runs.monitoring import gauge
-
         gauge("popgen_iteration", checkpoint.iteration, run=self.run, member=str(checkpoint.member))
 
     def on_member(self, added: MemberAdded) -> None:
         """Members in the population."""
-        from popgen.runs.monitoring import gauge
-
         gauge("popgen_members", added.member, run=self.run)
+
+
+class RunLog:
+    """`run.log` in the run's folder: one JSON object a line, each with time, level, run, attempt, event and place.
+
+    Where they apply: text, and other fields of the event. Events: start, note, checkpoint, member, lost (an actor or
+    node died), end. A line that cannot be written is dropped: the log never stops a run.
+
+    Attributes:
+        place: where the run is: the member in training, {} after the last, and its iteration once that is known.
+    """
+
+    def __init__(self, folder: Path, run: str, attempt: int) -> None:
+        self.path, self._common = folder / LOG, {"run": run, "attempt": attempt}
+        self.place: dict[str, int] = {}
+
+    def write(self, event: str, *, level: str = "INFO", **fields: Any) -> None:
+        """Append one line."""
+        stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
+        row = {"time": stamp, "level": level, **self._common, "event": event, **self.place, **fields}
+        try:
+            with self.path.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        except OSError:
+            return
+
+
+class LoggingReporter:
+    """A reporter whose notes are also lines of the run's log."""
+
+    def __init__(self, inner: Reporter, log: RunLog) -> None:
+        self.inner, self.log = inner, log
+
+    def phase(self, name: str, total: float) -> None:
+        """See `Reporter.phase`."""
+        self.log.write("note", text=name)
+        self.inner.phase(name, total)
+
+    def expect(self, seconds: float | None) -> None:
+        """See `Reporter.expect`."""
+        self.inner.expect(seconds)
+
+    def update(self, done: float, **figures: Figure) -> None:
+        """See `Reporter.update`."""
+        self.inner.update(done, **figures)
+
+    def note(self, text: str) -> None:
+        """See `Reporter.note`."""
+        self.log.write("note", text=text)
+        self.inner.note(text)
+
+    def close(self) -> None:
+        """See `Reporter.close`."""
+        self.inner.close()
 
 
 class RunLogSink(Sink):

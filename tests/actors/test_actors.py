@@ -8,14 +8,13 @@ import torch
 from support.small import kitchen, random_play
 
 from popgen.actors.samplers import SamplerActor
-from popgen.actors.xpm_wm_actors import ReplayActor
+from popgen.actors.xpm_wm_workers import ReplayActor
 from popgen.config.sections import EnvConfig
-from popgen.methods.training import PolicySnapshot
-from popgen.methods.transport import InlineTransport, Ready
+from popgen.methods.training import InlineTransport, PolicySnapshot, Ready
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.replay import Query, Request
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import RANDOM_MEMBER, Kind
 
 ENV = EnvConfig(params={"horizon": 20})

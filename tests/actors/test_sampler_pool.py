@@ -9,9 +9,8 @@ import pytest
 
 from popgen.actors.samplers import SamplerPool, sampler_seed
 from popgen.errors import UserError
-from popgen.methods.training import PolicySnapshot
-from popgen.methods.transport import InlineWorker, Ready
-from popgen.play.matches import Match
+from popgen.methods.training import InlineWorker, PolicySnapshot, Ready
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 

@@ -18,8 +18,7 @@ import popgen
 from popgen.envs import env_names, env_registry, make_env
 from popgen.methods import registry
 from popgen.methods.registry import METHODS
-from popgen.methods.training import Checkpoint
-from popgen.methods.transport import InlineTransport
+from popgen.methods.training import Checkpoint, InlineTransport
 
 Run = Callable[..., tuple[int, str, str]]
 ENTRY_POINTS = """\

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from popgen.nets.blocks import ConvDecoder, ConvEncoder, NormGRUCell, linear, mlp
+from popgen.methods.xpm_wm.latent_filter import NormGRUCell
+from popgen.nets.blocks import ConvDecoder, ConvEncoder, linear, mlp
 
 
 def test_linear_weights_have_the_variance_of_the_fan_average() -> None:

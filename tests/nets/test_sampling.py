@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from popgen.nets.blocks import draw_by_gumbel, draw_by_inversion, draw_by_multinomial
+from popgen.methods.xpm_wm.actor_critic import draw_by_inversion
+from popgen.nets.blocks import draw_by_gumbel, draw_by_multinomial
 
 SHARES = torch.tensor([0.5, 0.3, 0.15, 0.05])
 

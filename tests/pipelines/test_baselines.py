@@ -18,7 +18,6 @@ import pytest
 import ray
 import torch
 
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.actors.ray_transport import RayTransport
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
@@ -30,11 +29,12 @@ from popgen.methods.mappo.algorithm import Mappo as Algorithm
 from popgen.methods.mappo.config import DiversityConfig
 from popgen.methods.mappo.objective import SELF_PLAY
 from popgen.methods.mappo.train import GroupProgress, check_card, learning_members
-from popgen.methods.transport import InlineTransport
+from popgen.methods.training import InlineTransport
 from popgen.pipelines.population import open_training, run_population
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import Population, load_population
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.preflight import preflight
 from popgen.runs.recorder import RunRecorder

@@ -9,17 +9,17 @@ from typing import Any
 import pytest
 from support.small import kitchen
 
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.actors.ego_workers import open_training
 from popgen.errors import UserError
 from popgen.methods.ego.config import EgoRun
-from popgen.methods.transport import InlineTransport
+from popgen.methods.training import InlineTransport
 from popgen.pipelines.ego_training import make_ego_config
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.population import PopulationWriter, load_population
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.preflight import preflight
 from popgen.runs.recorder import RunRecorder

@@ -16,16 +16,15 @@ import numpy as np
 import pytest
 import ray
 
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.actors.xpm_wm_workers import open_training
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
-from popgen.methods.training import Collected, Round, TrainedMember
-from popgen.methods.transport import InlineTransport, Ready
-from popgen.methods.xpm_wm.member_progress import FirstMemberProgress, LaterMemberProgress, MemberWeights
-from popgen.methods.xpm_wm.real_play import Tally
+from popgen.methods.training import Collected, InlineTransport, Ready, Round, TrainedMember
+from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
+from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
+from popgen.methods.xpm_wm.real_play import MemberWeights, Tally
 from popgen.methods.xpm_wm.replay import KIND_CODE
 from popgen.methods.xpm_wm.train import FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import AgentUpdate, ModelTask, ModelUpdate, Setup
@@ -34,6 +33,7 @@ from popgen.pipelines.population import run_population
 from popgen.play.partner_strength import PartnerStrength
 from popgen.population import Population, load_population
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.state_files import load_state

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.methods.registry import METHODS, find_method, recipe
-from popgen.methods.transport import InlineTransport
+from popgen.methods.training import InlineTransport
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.nets.weights import under
 from popgen.pipelines.population import open_training
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.population import load_population
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.state_files import load_state

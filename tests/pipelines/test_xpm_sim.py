@@ -15,12 +15,11 @@ import pytest
 import ray
 
 from popgen.actors.actor_setup import build_env
-from popgen.actors.checkpoint_writer import CheckpointFiles
 from popgen.actors.xpm_sim_workers import open_training
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
-from popgen.methods.transport import InlineTransport
+from popgen.methods.training import InlineTransport
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.round_rules import (
     MemberProgress,
@@ -34,6 +33,7 @@ from popgen.pipelines.training_driver import TrainingDriver
 from popgen.play.episodes import Episode
 from popgen.population import load_population
 from popgen.progress import NullReporter
+from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.preflight import preflight
 from popgen.runs.recorder import RunRecorder

@@ -9,8 +9,7 @@ from support.small import kitchen
 
 from popgen.envs import BatchedEnv, make_env
 from popgen.play.episodes import Episode
-from popgen.play.matches import Match, split_matches
-from popgen.play.rollout import Sampler
+from popgen.play.rollout import Match, Sampler, split_matches
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind, Segment
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.scripted import ONE, STAY, TWO, Script
 
-from popgen.play.matches import Seating
+from popgen.play.rollout import Seating
 
 
 def observation(time: int, batch: int) -> dict[str, np.ndarray]:

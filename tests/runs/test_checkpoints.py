@@ -20,7 +20,7 @@ def whole_buffers() -> dict[str, Any]:
 
 def run_of(root: Path, saves: int, long: int = 10**6) -> Checkpoints:
     """A member's checkpoints after `saves` iterations of one segment each."""
-    checkpoints = Checkpoints(root, long=long, seconds=0.0)
+    checkpoints = Checkpoints(root, long=long)
     checkpoints.begin(None)
     segments = random_play(kitchen(2), 5)
     for number in range(saves):
@@ -52,13 +52,13 @@ def test_the_last_two_are_kept_with_what_they_need(tmp_path: Path) -> None:
 def test_the_one_before_counts_if_the_newest_is_damaged(tmp_path: Path, file: str) -> None:
     run_of(tmp_path, 3)
     turn_a_bit(tmp_path / "checkpoints" / "progress_000003" / file)
-    again = Checkpoints(tmp_path, long=10**6, seconds=0.0)
+    again = Checkpoints(tmp_path, long=10**6)
     state = again.load(1)
     assert state is not None and state["iteration"] == 1 and again.count == 2 and len(list(again.log())) == 2
     assert "progress_000003" in again.note and "\n" not in again.note
     again.keep(random_play(kitchen(2), 5), owner=1)
     again.save(1, {"iteration": 2, "ledger": 2}, whole_buffers)
-    fresh = Checkpoints(tmp_path, long=10**6, seconds=0.0)
+    fresh = Checkpoints(tmp_path, long=10**6)
     assert fresh.load(1)["iteration"] == 2 and not fresh.note  # type: ignore[index]
     assert {"progress_000002", "progress_000003"} <= names(tmp_path)
 
@@ -68,14 +68,14 @@ def test_one_line_if_all_are_damaged(tmp_path: Path) -> None:
     for number in (2, 3):
         turn_a_bit(tmp_path / "checkpoints" / f"progress_{number:06d}" / "arrays.safetensors")
     with pytest.raises(UserError, match="progress_000003") as caught:
-        Checkpoints(tmp_path, long=10**6, seconds=0.0).load(1)
+        Checkpoints(tmp_path, long=10**6).load(1)
     assert "\n" not in str(caught.value)
 
 
 def test_damaged_segments_are_noticed(tmp_path: Path) -> None:
     run_of(tmp_path, 2)
     turn_a_bit(tmp_path / "checkpoints" / "segments_000001")
-    again = Checkpoints(tmp_path, long=10**6, seconds=0.0)
+    again = Checkpoints(tmp_path, long=10**6)
     again.load(1)
     with pytest.raises(UserError, match="segments_000001: unreadable"):
         list(again.log())
@@ -83,7 +83,7 @@ def test_damaged_segments_are_noticed(tmp_path: Path) -> None:
 
 def test_another_member_begins_anew(tmp_path: Path) -> None:
     checkpoints = run_of(tmp_path, 2)
-    assert Checkpoints(tmp_path, long=10**6, seconds=0.0).load(2) is None
+    assert Checkpoints(tmp_path, long=10**6).load(2) is None
     folder = member_folder(tmp_path, 1)
     save_state(folder, whole_buffers())
     checkpoints.begin(folder)

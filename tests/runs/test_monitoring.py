@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,8 +13,9 @@ import pytest
 
 from popgen.errors import UserError
 from popgen.progress import NullReporter
-from popgen.runs import monitoring as watch
-from popgen.runs.monitoring import GAUGES, DiskWatch, LoggingReporter, RunLog, show_figures
+from popgen.runs import sinks
+from popgen.runs.recorder import DiskWatch
+from popgen.runs.sinks import GAUGES, LoggingReporter, RunLog, show_figures
 
 
 @pytest.fixture
@@ -30,9 +32,9 @@ def gauges(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, ...], float]:
             assert set(tags) == set(self.keys)
             seen[self.name, *(tags[key] for key in self.keys)] = value
 
-    monkeypatch.setattr(watch, "Gauge", Fake)
-    monkeypatch.setattr(watch, "_gauges", {})
-    monkeypatch.setattr(watch, "ray", SimpleNamespace(is_initialized=lambda: True))
+    monkeypatch.setattr(sinks, "_gauges", {})
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: True))
+    monkeypatch.setitem(sys.modules, "ray.util.metrics", SimpleNamespace(Gauge=Fake))
     return seen
 
 
@@ -59,7 +61,9 @@ def test_what_is_not_finite_and_what_has_no_ray_is_left_out(
     gauges: dict[tuple[str, ...], float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     show_figures("r", 1, {"real_sp": float("nan")})
-    monkeypatch.setattr(watch, "ray", SimpleNamespace(is_initialized=lambda: False))
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False))
+    show_figures("r", 1, {"real_sp": 1.0})
+    monkeypatch.delitem(sys.modules, "ray")
     show_figures("r", 1, {"real_sp": 1.0})
     assert not gauges
     assert all(name.startswith("popgen_") and "run" in tags for name, (_, tags) in GAUGES.items())

@@ -7,14 +7,12 @@ from jaxtyping import install_import_hook
 CHECKED = [
     "popgen.losses",
     "popgen.nets.blocks",
-    "popgen.nets.blocks",
     "popgen.nets.feed_forward",
     "popgen.play.trajectories",
     "popgen.methods.xpm_wm.world_model",
-    "popgen.methods.xpm_wm.world_model",
     "popgen.methods.xpm_wm.latent_filter",
     "popgen.methods.xpm_wm.agent_update",
-    "popgen.methods.xpm_wm.agent_update",
+    "popgen.methods.xpm_wm.actor_critic",
 ]
 """Modules whose public functions name the dimensions of their arrays."""
 

@@ -10,7 +10,7 @@ import torch
 from popgen.envs.contract import ViewSpec
 from popgen.methods.mappo.slots import Rollout
 from popgen.nets.feed_forward import Sizes, ValueNet
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 VIEW = ViewSpec((1,), "float32", False, swap=(0,))

@@ -11,8 +11,7 @@ from popgen.envs import BatchedEnv, make_env
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.replay import Query, Replay, Windows
-from popgen.play.matches import Match
-from popgen.play.rollout import Sampler
+from popgen.play.rollout import Match, Sampler
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind
 

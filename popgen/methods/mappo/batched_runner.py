@@ -22,7 +22,7 @@ from popgen.methods.mappo.slots import Actor, Rollout, SlotPool
 from popgen.methods.mappo.training_job import Job, sizes_of
 from popgen.nets.feed_forward import FeedForwardNet
 from popgen.nets.weights import Weights, load_weights
-from popgen.play.matches import Match, share_of_each
+from popgen.play.rollout import Match, share_of_each
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.mappo.config import E3tRun
 from popgen.methods.mappo.objective import Objective
 from popgen.methods.mappo.train import RllibTraining, open_rllib
-from popgen.methods.transport import Transport
+from popgen.methods.training import Transport
 
 
 def open_training(config: E3tRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     return open_rllib(config, spec, attempt, transport, Objective(noise=config.e3t.epsilon))

@@ -16,8 +16,7 @@ from popgen.methods.mappo.objective import SELF_PLAY
 from popgen.methods.mappo.train import RllibTraining, refuse_inline
 from popgen.methods.mappo.training_job import policy_config
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
-from popgen.methods.training import Checkpoint, Loop, State, TrainedMember
-from popgen.methods.transport import Transport
+from popgen.methods.training import Checkpoint, Loop, State, TrainedMember, Transport
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import SKILLS
 
@@ -78,6 +77,6 @@ class FcpTraining(RllibTraining):
 
 
 def open_training(config: FcpRun, spec: EnvSpec, attempt: str, transport: Transport) -> FcpTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     refuse_inline(transport)
     return FcpTraining(config, spec, attempt)

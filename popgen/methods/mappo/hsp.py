@@ -27,8 +27,7 @@ from popgen.methods.mappo.needs import roles_of
 from popgen.methods.mappo.objective import Objective
 from popgen.methods.mappo.train import STEP_SECONDS, RllibTraining, refuse_inline
 from popgen.methods.mappo.training_job import Job
-from popgen.methods.training import PlannedPhase, TrainedMember
-from popgen.methods.transport import Transport
+from popgen.methods.training import PlannedPhase, TrainedMember, Transport
 from popgen.play.event_diversity import choose_most_distant, choose_most_diverse
 from popgen.types import BIASED_ROLE
 
@@ -130,6 +129,6 @@ def _mean_figures(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def open_training(config: HspRun | BpRun, spec: EnvSpec, attempt: str, transport: Transport) -> HspTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     refuse_inline(transport)
     return HspTraining(config, spec, attempt)

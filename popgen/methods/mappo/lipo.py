@@ -13,7 +13,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.mappo.config import LipoRun
 from popgen.methods.mappo.objective import Objective, Term
 from popgen.methods.mappo.train import RllibTraining, open_rllib
-from popgen.methods.transport import Transport
+from popgen.methods.training import Transport
 from popgen.types import Kind
 
 CROSS_PLAY = Term(Kind.XP, weight=lambda recipe: recipe.lambda_xp)
@@ -22,5 +22,5 @@ OBJECTIVE = Objective(terms=(CROSS_PLAY,), fresh_episodes=False)
 
 
 def open_training(config: LipoRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     return open_rllib(config, spec, attempt, transport, OBJECTIVE)

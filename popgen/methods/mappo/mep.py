@@ -17,7 +17,7 @@ from popgen.methods.mappo.config import MepRun
 from popgen.methods.mappo.objective import Objective
 from popgen.methods.mappo.population_bonus import JointLogProbs
 from popgen.methods.mappo.train import RllibTraining, open_rllib
-from popgen.methods.transport import Transport
+from popgen.methods.training import Transport
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class SurpriseBonus:
 
 
 def open_training(config: MepRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     settings = config.mep
     bonus = SurpriseBonus(settings.alpha, settings.floor) if settings.alpha > 0.0 else None
     return open_rllib(config, spec, attempt, transport, Objective(together=True, bonus=bonus))

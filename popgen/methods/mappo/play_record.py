@@ -14,8 +14,8 @@ from popgen.methods.mappo.config import DiversityConfig
 from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
-from popgen.play.matches import Match
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength, any_then_strongest
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 HABIT_DECAY = 0.9

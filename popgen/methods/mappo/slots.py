@@ -15,7 +15,7 @@ from popgen.envs.player_events import count_player_events, name_player_events
 from popgen.envs.reward import training_reward
 from popgen.nets.blocks import DrawnActions, draw_by_gumbel
 from popgen.play.episodes import Episode
-from popgen.play.matches import Match, columns_of, match_of_columns
+from popgen.play.rollout import Match, columns_of, match_of_columns
 from popgen.types import Kind
 
 Actor = Callable[[Tensor, Tensor], Tensor]

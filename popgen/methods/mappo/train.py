@@ -26,6 +26,7 @@ from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.training_job import Job, policy_config
 from popgen.methods.training import (
     Checkpoint,
+    InlineTransport,
     Loop,
     Phase,
     PlannedPhase,
@@ -34,8 +35,8 @@ from popgen.methods.training import (
     State,
     StepCount,
     TrainedMember,
+    Transport,
 )
-from popgen.methods.transport import InlineTransport, Transport
 from popgen.nets.weights import Weights, prefixed
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import Kind
@@ -310,5 +311,5 @@ def refuse_inline(transport: Transport) -> None:
 
 
 def open_training(config: BaselineRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
-    """MAPPO alone: members differ by their seeds. See `popgen.methods.transport.OpenTraining`."""
+    """MAPPO alone: members differ by their seeds. See `popgen.methods.training.OpenTraining`."""
     return open_rllib(config, spec, attempt, transport, SELF_PLAY)

@@ -12,7 +12,7 @@ from popgen.methods.mappo.hidden_utility import Utility
 from popgen.methods.mappo.population_bonus import PopulationBonus
 from popgen.nets.feed_forward import Sizes
 from popgen.nets.weights import Weights
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 

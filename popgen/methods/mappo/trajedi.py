@@ -20,7 +20,7 @@ from popgen.methods.mappo.config import TrajediRun
 from popgen.methods.mappo.objective import Objective
 from popgen.methods.mappo.population_bonus import JointLogProbs
 from popgen.methods.mappo.train import RllibTraining, open_rllib
-from popgen.methods.transport import Transport
+from popgen.methods.training import Transport
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class DivergenceBonus:
 
 
 def open_training(config: TrajediRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     settings = config.trajedi
     bonus = DivergenceBonus(settings.alpha, settings.kernel) if settings.alpha > 0.0 else None
     return open_rllib(config, spec, attempt, transport, Objective(together=True, bonus=bonus))

@@ -10,7 +10,7 @@ import numpy as np
 from popgen.methods.training import State
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.play.episodes import Episode
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from popgen.methods.training import Figures, Pending, PolicySnapshot, Sampled, Segments, State
 from popgen.nets.weights import Weights
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 
 
 @dataclass(frozen=True)

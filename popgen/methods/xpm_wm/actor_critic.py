@@ -8,6 +8,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from pydantic import ValidationError
 from torch import Tensor, nn
 
@@ -18,9 +19,19 @@ from popgen.methods.xpm_wm.config import ACTING, AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.latent_filter import Latent, player_masks
 from popgen.methods.xpm_wm.world_model import LatentFilter
 from popgen.nets import weights as w
-from popgen.nets.blocks import TwoHot, draw_by_inversion, mlp
+from popgen.nets.blocks import mlp
 from popgen.policies.portable_program import Program, ProgramWriter
 from popgen.types import check_reset
+
+
+def draw_by_inversion(
+    log_probs: Float[Tensor, "*batch A"], generator: torch.Generator | None = None
+) -> Int[Tensor, "*batch"]:
+    """By inverting the cumulative distribution: one uniform number an action, the fewest draws; for imagination."""
+    cumulative = log_probs.exp().cumsum(-1)
+    uniform = torch.rand(cumulative.shape[:-1], generator=generator, device=cumulative.device)
+    actions = (cumulative < uniform.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
+    return actions.clamp(max=cumulative.shape[-1] - 1)
 
 
 class Actor(nn.Module):
@@ -72,6 +83,37 @@ class Actor(nn.Module):
         own = writer.add_operation("times", (z, writer.add_linear("seat", self.masks.T)))
         inputs = writer.add_operation("join", ([h] if self.use_h else []) + [own, "seat"])
         return writer.finish(writer.add_layers(self.net, inputs), unimix=self.config.unimix)
+
+
+class TwoHot(nn.Module):
+    """Bins at symexp of an even grid over [-limit, limit]; exactly antisymmetric, so flat logits mean 0.
+
+    An odd number of bins keeps one at 0. `limit` is in symlog units: 7 covers returns of about +-1,100.
+    """
+
+    bins: Tensor
+
+    def __init__(self, bins: int, limit: float = 7.0) -> None:
+        super().__init__()
+        half = torch.expm1(torch.linspace(0.0, limit, bins // 2 + 1))[1:]
+        middle = torch.zeros(bins % 2)
+        self.register_buffer("bins", torch.cat([-half.flip(0), middle, half]), persistent=False)
+
+    def mean(self, logits: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch"]:
+        """The expected value."""
+        return (torch.softmax(logits.float(), -1) * self.bins).sum(-1)
+
+    def loss(self, logits: Float[Tensor, "*batch K"], target: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Cross-entropy (...) of the two-hot encoding of `target` (...) under logits (..., K)."""
+        bins = self.bins
+        target = target.detach().clamp(float(bins[0]), float(bins[-1])).contiguous()
+        above = torch.searchsorted(bins, target).clamp(1, len(bins) - 1)
+        low, high = bins[above - 1], bins[above]
+        weight = (target - low) / (high - low)
+        log_probs = torch.log_softmax(logits, -1)
+        below_log = log_probs.gather(-1, (above - 1).unsqueeze(-1)).squeeze(-1)
+        above_log = log_probs.gather(-1, above.unsqueeze(-1)).squeeze(-1)
+        return -((1.0 - weight) * below_log + weight * above_log)
 
 
 class Critic(nn.Module):

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec, ViewSpec
 from popgen.methods.xpm_wm.config import WorldModelConfig
-from popgen.nets.blocks import ConvEncoder, NormGRUCell, mlp
+from popgen.nets.blocks import ConvEncoder, linear, mlp
 from popgen.policies.portable_program import ProgramWriter
 from popgen.types import check
 
@@ -142,6 +142,23 @@ class JointEncoder(nn.Module):
             return self.trunk(obs.flatten(1))
         obs = obs - self.center
         return self.trunk(self.conv(torch.cat([obs[:, 0], obs[:, 1]], -1)))
+
+
+class NormGRUCell(nn.Module):
+    """GRU cell with one layer norm over its three gates (DreamerV2/V3); starts out slow to forget."""
+
+    def __init__(self, inputs: int, units: int) -> None:
+        super().__init__()
+        self.units = units
+        self.gates = linear(inputs + units, 3 * units)
+        self.norm = nn.LayerNorm(3 * units, eps=1e-3)
+
+    def forward(self, inputs: Tensor, hidden: Tensor) -> Tensor:
+        """inputs (B, I), hidden (B, D) -> (B, D)."""
+        reset, candidate, update = self.norm(self.gates(torch.cat([inputs, hidden], -1))).chunk(3, -1)
+        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+        update = torch.sigmoid(update - 1.0)
+        return hidden + update * (candidate - hidden)
 
 
 class LatentFilter(nn.Module):

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Loop, Pending, PlannedPhase, Progress, State, TrainedMember
-from popgen.methods.xpm_wm import phase_rules as rules
+from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import WorldModelRun
-from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress
-from popgen.methods.xpm_wm.real_play import Tally
+from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
+from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
+from popgen.methods.xpm_wm.real_play import Candidate, Tally, goes_by_tally
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
@@ -27,19 +28,19 @@ def plan_phases(config: WorldModelRun, spec: EnvSpec) -> list[PlannedPhase]:
     model_update = config.world_model.batch * config.world_model.length * ROW_SECONDS
     alone = agent.starts_sp * agent.horizon * IMAGINED_SECONDS
     together = (agent.starts_sp + agent.starts_xp) * agent.horizon * IMAGINED_SECONDS
-    rounds = rules.self_play_steps(one) / (one.envs * one.steps_per_iteration)
+    rounds = phase1.self_play_steps(one) / (one.envs * one.steps_per_iteration)
     each = one.model_updates * model_update + one.agent_updates * alone
     phases = [
-        PlannedPhase(rules.RANDOM_PLAY, FIRST, one.prefill_steps * STEP_SECONDS),
-        PlannedPhase(rules.MODEL_ALONE, FIRST, one.pretrain_updates * model_update),
-        PlannedPhase(rules.SELF_PLAY, FIRST, rounds * each, earliest=0.0),
+        PlannedPhase(phase1.RANDOM_PLAY, FIRST, one.prefill_steps * STEP_SECONDS),
+        PlannedPhase(phase1.MODEL_ALONE, FIRST, one.pretrain_updates * model_update),
+        PlannedPhase(phase1.SELF_PLAY, FIRST, rounds * each, earliest=0.0),
     ]
     for member in range(FIRST + 1, config.population.size + 1):
-        most = rules.most_rounds(two, rules.cross_play_episodes(two, member - 1), spec.horizon)
-        updates = rules.count_imagination(two, most)
+        most = phase2.most_rounds(two, phase2.cross_play_episodes(two, member - 1), spec.horizon)
+        updates = phase2.count_imagination(two, most)
         cost = updates * together + (most - 1) * two.model_updates * model_update
-        earliest = rules.count_imagination(two, min(two.rounds, most)) / updates
-        phases.append(PlannedPhase(rules.IMAGINATION, member, cost, earliest=earliest))
+        earliest = phase2.count_imagination(two, min(two.rounds, most)) / updates
+        phases.append(PlannedPhase(phase2.IMAGINATION, member, cost, earliest=earliest))
     return phases
 
 
@@ -102,7 +103,7 @@ class XpmWmTraining:
         return Setup(self.work, self.config, self.spec, self.member, self.seed, self.archive, self._read_tally)
 
     def _read_tally(self) -> Tally | None:
-        return self.work.tally(self.member).result() if rules.goes_by_tally(self.config.discovery) else None
+        return self.work.tally(self.member).result() if goes_by_tally(self.config.discovery) else None
 
     def _first(self) -> FirstMember:
         assert isinstance(self.progress, FirstMemberProgress)

@@ -1,4 +1,5 @@
-"""Real play: who plays in the real environments, policies as they travel to samplers, and what play has shown."""
+"""Real play: who plays in the real environments, policies as they travel to samplers, and what play has shown: of a
+policy, of the world, and of the imagination beside it."""
 
 from __future__ import annotations
 
@@ -9,15 +10,38 @@ from typing import Any
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
-from popgen.methods.training import Pending, PolicySnapshot, Sampled
-from popgen.methods.xpm_wm.config import WorldModelRun
+from popgen.methods.training import Pending, PolicySnapshot, Sampled, State
+from popgen.methods.xpm_wm.config import DiscoveryConfig, WatchConfig, WorldModelRun
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.types import RANDOM_MEMBER, Kind, Segment
 
 Pair = tuple[int, int]
+
+
+Put = Callable[[Any], Pending[Any]]
+"""Into the workers' store."""
+
+
+@dataclass(frozen=True)
+class MemberWeights:
+    """Handles of what a member's learner published: filter and actor (`acting`), critics, and the world model, of the
+    same filter, that it learned in."""
+
+    acting: Pending[Weights]
+    critics: Pending[Weights]
+    model: Pending[Weights]
+
+    def to_state(self) -> State:
+        """For a checkpoint."""
+        return {"acting": self.acting, "critics": self.critics, "model": self.model}
+
+    @staticmethod
+    def from_state(state: State, put: Put) -> MemberWeights:
+        """From `to_state()`, as it was read."""
+        return MemberWeights(put(state["acting"]), put(state["critics"]), put(state["model"]))
 
 
 def policy_snapshot(config: WorldModelRun, acting: Pending[Weights]) -> PolicySnapshot:
@@ -31,7 +55,7 @@ def policy_snapshots(config: WorldModelRun, acting: Mapping[int, Pending[Weights
     return {member: policy_snapshot(config, weights) for member, weights in acting.items()}
 
 
-def random_snapshot(spec: EnvSpec, interact: float, put: Callable[[Any], Pending[Any]]) -> PolicySnapshot:
+def random_snapshot(spec: EnvSpec, interact: float, put: Put) -> PolicySnapshot:
     """The random player; where there is such an action, it interacts with probability `interact` (0: as any other)."""
     names, probabilities = spec.action_names, None
     if interact and "interact" in names:
@@ -79,7 +103,108 @@ def steps_of(sampled: Sequence[Sampled]) -> int:
 # ---- what play has shown ---------------------------------------------------------------------------------------------
 
 
-_LARGEST = 2**62
+@dataclass(frozen=True)
+class Candidate:
+    """A policy as it played some real episodes, and what it scored in self-play and strongest cross-play."""
+
+    weights: MemberWeights
+    sp: float
+    xp: float
+
+    def merit(self, xp_limit: float | None = None) -> float:
+        """Self-play less the strongest cross-play: what a member is chosen by. Cross-play below its limit is worth no
+        more than at it."""
+        return self.sp - (self.xp if xp_limit is None else max(self.xp, xp_limit))
+
+    def to_state(self) -> State:
+        """For a checkpoint."""
+        return {"published": self.weights.to_state(), "sp": self.sp, "xp": self.xp}
+
+    @staticmethod
+    def from_state(state: State, put: Put) -> Candidate:
+        """From `to_state()`, as it was read."""
+        return Candidate(MemberWeights.from_state(state["published"], put), float(state["sp"]), float(state["xp"]))
+
+
+LEAST_PAY = 0.05
+"""Imagined reward a step below which nothing is farmed: a pick-up every twenty steps."""
+
+
+@dataclass
+class Watch:
+    """What a member's training has shown so far.
+
+    Attributes:
+        gap: rounds in a row in which imagination paid too much.
+        best_precision: of events at one step, the highest so far.
+        imprecise: reports in a row that were far below it.
+        told: that imagination pays too much has been said; it is said again after a round in which it did not.
+        told_precision: the same of precision.
+    """
+
+    gap: int = 0
+    best_precision: float = 0.0
+    imprecise: int = 0
+    told: bool = False
+    told_precision: bool = False
+
+    def look(self, figures: Mapping[str, float], report: Mapping[str, float], config: WatchConfig, rounds: int) -> str:
+        """What is to be said after a round, "" if nothing.
+
+        Args:
+            figures: of the round.
+            report: of the world model, where one has come in with the round.
+            config: of the watch.
+            rounds: how many in a row it takes to speak of a gap.
+        """
+        lines = [self._look_at_pay(figures, config, rounds), self._look_at_events(report, config)]
+        return "; ".join(line for line in lines if line)
+
+    def _look_at_pay(self, figures: Mapping[str, float], config: WatchConfig, rounds: int) -> str:
+        imagined, real = figures.get("agent/imagined_shaped_sp"), figures.get("real_shaped_sp")
+        if imagined is None or real is None or not config.imagined_factor:
+            return ""
+        if imagined <= max(LEAST_PAY, config.imagined_factor * real):
+            self.gap, self.told = 0, False
+            return ""
+        self.gap += 1
+        if self.gap < rounds or self.told:
+            return ""
+        self.told = True
+        return (
+            f"imagination has paid {imagined:.2f} a step and real self-play {real:.2f} for {self.gap} rounds, the "
+            "actor may be farming the world model's errors: give the model more updates (phase1.model_updates, "
+            "phase2.model_updates) or trust its events less (discovery.trust=2)"
+        )
+
+    def _look_at_events(self, report: Mapping[str, float], config: WatchConfig) -> str:
+        precision = report.get("report/event_precision_step1")
+        if precision is None or not config.precision_share:
+            return ""
+        self.best_precision = max(self.best_precision, precision)
+        if precision >= config.precision_share * self.best_precision:
+            self.imprecise, self.told_precision = 0, False
+            return ""
+        self.imprecise += 1
+        if self.imprecise < config.precision_reports or self.told_precision:
+            return ""
+        self.told_precision = True
+        return (
+            f"{precision:.0%} of the events that the world model predicts a step ahead are real, "
+            f"{self.best_precision:.0%} were: give it more updates or a lower learning rate "
+            "(world_model.learning_rate, phase2.model_lr)"
+        )
+
+    def to_state(self) -> State:
+        """For a checkpoint."""
+        return dict(vars(self))
+
+    @staticmethod
+    def from_state(state: State) -> Watch:
+        """From `to_state()`, as it was read."""
+        counts = {name: int(state[name]) for name in ("gap", "imprecise")}
+        said = {name: bool(state[name]) for name in ("told", "told_precision")}
+        return Watch(best_precision=float(state["best_precision"]), **counts, **said)
 
 
 @dataclass(frozen=True)
@@ -115,6 +240,9 @@ class Tally:
         events, own_events, keys, visits = (np.asarray(state[name], np.int64) for name in names)
         known = tuple(np.asarray(state["known"][str(part)], np.int64) for part in range(len(state["known"])))
         return Tally(events, own_events, int(state["own_steps"]), keys, visits, known)
+
+
+_LARGEST = 2**62
 
 
 def part_weights(view: ViewSpec) -> tuple[np.ndarray, ...]:
@@ -187,3 +315,13 @@ class TallyKeeper:
         self.steps = {(int(o), str(kind)): int(steps) for o, kind, steps in state["steps"]}
         self.visits = {int(key): int(count) for key, count in np.asarray(state["visits"]).tolist()}
         self.known = [set(map(int, part)) for part in state["known"]]
+
+
+def goes_by_tally(config: DiscoveryConfig) -> bool:
+    """Whether anything depends on what real play has shown."""
+    return bool(config.count_bonus or config.found_events or config.rare_events or config.trust)
+
+
+def rare_events(tally: Tally | None, config: DiscoveryConfig) -> tuple[int, ...]:
+    """Events that real play has shown too seldom to imagine what follows them."""
+    return () if tally is None else tuple(np.flatnonzero(tally.events < config.rare_events).tolist())

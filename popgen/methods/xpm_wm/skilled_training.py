@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
 from popgen.methods.training import TrainedMember
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
-from popgen.methods.xpm_wm.member_progress import LaterMemberProgress
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
+from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
 from popgen.methods.xpm_wm.train import FIRST
 from popgen.types import SKILLS
 

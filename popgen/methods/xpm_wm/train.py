@@ -10,12 +10,12 @@ from collections.abc import Generator
 from dataclasses import replace
 
 from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled, named_figures
-from popgen.methods.xpm_wm import phase_rules as rules
+from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
 from popgen.methods.xpm_wm.imagination import Starts
-from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
 from popgen.methods.xpm_wm.overlap import Overlap
+from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, ModelTask, ModelUpdate, Setup
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
@@ -33,7 +33,7 @@ MODEL_PIECE, AGENT_PIECE = 100, 50  # updates between two signs of progress
 class FirstMember:
     """Phase 1: random play, world-model updates alone, then rounds of sampling, model and agent learning."""
 
-    def __init__(self, setup: Setup, progress: FirstMemberProgress) -> None:
+    def __init__(self, setup: Setup, progress: phase1.FirstMemberProgress) -> None:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
         self.phase, self.progress, self.tally = self.config.phase1, progress, setup.tally
         self.reports = ModelReports(self.work, self.phase.check_every, waits=self.config.run.schedule == "sync")
@@ -43,37 +43,37 @@ class FirstMember:
         if not resumed:
             yield from self.collect_random_episodes()
             yield from self.pretrain()
-        yield rules.describe_self_play(self.progress, self.phase)
+        yield phase1.describe_self_play(self.progress, self.phase)
         if not resumed:
             self.start_self_play()
             yield Round(FIRST, self.progress.steps, number=0, must_save=True)
         overlap = Overlap.of_run(self.config.run, self.work.samplers(), LEARNERS, self.work.wait)
         while True:
             yield from self.play_rounds(overlap)
-            if not rules.is_done(self.progress, self.phase) or (yield from self.confirm()):
-                return rules.choose_first(self.progress)
+            if not phase1.is_done(self.progress, self.phase) or (yield from self.confirm()):
+                return phase1.choose_first(self.progress)
             self.start_self_play()
 
     def collect_random_episodes(self) -> Records:
         """Lines 2 and 3: B_SP is populated with K random episodes."""
         phase, progress = self.phase, self.progress
-        yield Phase(rules.RANDOM_PLAY, phase.prefill_steps, FIRST)
+        yield Phase(phase1.RANDOM_PLAY, phase.prefill_steps, FIRST)
         snapshot = real.random_snapshot(self.spec, phase.prefill_interact, self.work.put)
         self.work.start_episodes([real.random_match(phase.envs)], {RANDOM_MEMBER: snapshot}, self.seed)
         while progress.steps < phase.prefill_steps:
             missing = (phase.prefill_steps - progress.steps) // phase.envs
             self.add_to_buffers(sampled := self.work.collect(max(1, min(PREFILL_CHUNK, missing))))
-            yield rules.describe_random_play(progress, tuple(sampled))
+            yield phase1.describe_random_play(progress, tuple(sampled))
 
     def pretrain(self) -> Records:
         """World-model updates alone, in pieces for the progress bar; then the agent's first ones."""
         total = self.phase.pretrain_updates
-        yield Phase(rules.MODEL_ALONE, total, FIRST)
+        yield Phase(phase1.MODEL_ALONE, total, FIRST)
         for done in range(0, total, MODEL_PIECE):
             count = min(MODEL_PIECE, total - done)
             update = self.update_world_model(count).result()
             self.progress.model, self.progress.starts = update.weights, update.starts
-            yield rules.describe_pretraining(self.progress, named_figures("model", update.metrics), done + count)
+            yield phase1.describe_pretraining(self.progress, named_figures("model", update.metrics), done + count)
         self.progress.published = self.update_agent().result().weights
 
     def start_self_play(self, stagger: bool = True) -> None:
@@ -86,7 +86,7 @@ class FirstMember:
         """Line 4, with lines 5-7, 8-15 and 17-18 side by side; a round ends when the slowest of them has advanced."""
         progress, resting = self.progress, False
         while True:
-            if not resting and not rules.should_stop(progress, self.phase):
+            if not resting and not phase1.should_stop(progress, self.phase):
                 for kind in overlap.startable():
                     overlap.start(kind, self.start_task(kind))
             if not overlap.running:
@@ -116,7 +116,7 @@ class FirstMember:
         not know what follows a rare event, and nothing corrects it."""
         progress, discovery = self.progress, self.config.discovery
         chosen = progress.plays or self.phase.event_starts == "always"
-        rare = rules.rare_events(self.tally(), discovery)
+        rare = real.rare_events(self.tally(), discovery)
         recent = self.phase.envs * self.phase.steps_per_iteration if discovery.trust else 0
         return self.work.update_world_model(ModelTask(updates, self.config.agent.starts_sp, chosen, rare, recent))
 
@@ -151,16 +151,16 @@ class FirstMember:
         progress, watch = self.progress, self.config.watch
         progress.rounds += 1
         report = self.reports.after_round(progress.rounds)
-        progress.figures |= rules.window_figures(progress, self.spec.horizon) | report | overlap.figures()
-        rules.keep_best(progress, self.phase, self.config.agent.entropy_after)
+        progress.figures |= phase1.window_figures(progress, self.spec.horizon) | report | overlap.figures()
+        phase1.keep_best(progress, self.phase, self.config.agent.entropy_after)
         trouble = progress.watch.look(progress.figures, report, watch, watch.first_rounds)
         note = self.restart_if_due() or (trouble and f"member 1: {trouble}")
-        ended = rules.describe_first_round(progress, self.phase, self.spec.score_name)
+        ended = phase1.describe_first_round(progress, self.phase, self.spec.score_name)
         return replace(ended, sampled=sampled, at_rest=not overlap.running, note=note, work=dict(overlap.work))
 
     def restart_if_due(self) -> str:
         """Line 1 again on the world model learned so far; a note about it."""
-        if not rules.restart_is_due(self.progress, self.phase):
+        if not phase1.restart_is_due(self.progress, self.phase):
             return ""
         self.progress.restarted = True
         self.work.restart_agent(self.seed + 500)
@@ -171,13 +171,13 @@ class FirstMember:
     def confirm(self) -> Generator[Record, bool | None, bool]:
         """Whether a whole episode of the last policy in each environment is good; so where the budget has no room."""
         progress = self.progress
-        if not rules.may_confirm(progress, self.phase, self.spec.horizon):
+        if not phase1.may_confirm(progress, self.phase, self.spec.horizon):
             return True
         progress.confirmations += 1
         self.start_self_play(stagger=False)
         episodes = self.add_to_buffers(sampled := self.work.collect(self.spec.horizon))
-        score = rules.confirm_policy(progress, episodes, self.phase)
-        note = rules.describe_confirmation(progress, score, len(episodes), self.spec.score_name)
+        score = phase1.confirm_policy(progress, episodes, self.phase)
+        note = phase1.describe_confirmation(progress, score, len(episodes), self.spec.score_name)
         yield Progress(FIRST, progress.steps, sampled=tuple(sampled), note=note)
         return progress.confirmed
 
@@ -185,20 +185,20 @@ class FirstMember:
 class LaterMember:
     """Phase 2: imagination first, then few rounds of real episodes, world-model updates and imagination."""
 
-    def __init__(self, setup: Setup, progress: LaterMemberProgress) -> None:
+    def __init__(self, setup: Setup, progress: phase2.LaterMemberProgress) -> None:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
         self.member, self.archive = setup.member, setup.archive
         self.phase, self.progress, self.tally = self.config.phase2, progress, setup.tally
-        self.episodes_xp = rules.cross_play_episodes(self.phase, len(self.archive))
+        self.episodes_xp = phase2.cross_play_episodes(self.phase, len(self.archive))
         self.pairs = real.seatings(self.member, sorted(self.archive)) if self.episodes_xp else []
-        self.most_rounds = rules.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
+        self.most_rounds = phase2.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
         self.imagined: dict[str, float] = {}
 
     def train(self) -> Loop:
         """All rounds; line 1 is done."""
         phase, progress = self.phase, self.progress
-        yield rules.describe_imagination(progress, phase, self.member, self.most_rounds)
-        while rules.plays_on(progress, phase, self.most_rounds):  # 4
+        yield phase2.describe_imagination(progress, phase, self.member, self.most_rounds)
+        while phase2.plays_on(progress, phase, self.most_rounds):  # 4
             update = None if phase.model_lag else self.update_world_model()  # 5-7
             starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
             update = self.update_world_model() if phase.model_lag else update  # 5-7, beside 8-16
@@ -218,14 +218,14 @@ class LaterMember:
     def learn_in_imagination(self, model: Pending[Weights], starts: Pending[Starts]) -> Learning:
         """Lines 8 to 15, in pieces for the progress bar: simulated self-play and cross-play with the strongest partner
         so far (9), objective (11-13), updates (14, 15)."""
-        progress, plan = self.progress, rules.plan_imagination(self.progress.rounds, self.phase)
+        progress, plan = self.progress, phase2.plan_imagination(self.progress.rounds, self.phase)
         scores, pressed, done = progress.strength.scores(), progress.constraint.multipliers, plan.done  # 9
         task = AgentTask(0, model, starts, plan.new_share, scores, progress.plays, self.tally(), multipliers=pressed)
         while True:
             count = min(AGENT_PIECE, plan.done + plan.updates - done)
             update = self.work.update_agent(replace(task, updates=count)).result()  # 11-15
             self.imagined, done = named_figures("agent", update.metrics) | {"updates": done}, done + count
-            yield rules.describe_updates(progress, self.member, self.imagined, done)
+            yield phase2.describe_updates(progress, self.member, self.imagined, done)
             if done == plan.done + plan.updates:
                 return update.weights
 
@@ -242,9 +242,9 @@ class LaterMember:
         """What the real episodes say: whether this is the best round, and each partner's cross-play return."""
         progress, watch = self.progress, self.config.watch
         progress.steps += real.steps_of(sampled)
-        scored = rules.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
+        scored = phase2.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
         progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
         trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
-        ended = rules.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)
-        goes_on, keeps = rules.plays_on(progress, self.phase, self.most_rounds), progress.skills is not None
+        ended = phase2.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)
+        goes_on, keeps = phase2.plays_on(progress, self.phase, self.most_rounds), progress.skills is not None
         return replace(ended, sampled=tuple(sampled), at_rest=goes_on or keeps, must_save=keeps and not goes_on)

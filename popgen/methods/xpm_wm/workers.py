@@ -10,10 +10,9 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.imagination import Starts
-from popgen.methods.xpm_wm.member_progress import MemberWeights
-from popgen.methods.xpm_wm.real_play import Tally
+from popgen.methods.xpm_wm.real_play import MemberWeights, Tally
 from popgen.nets.weights import Weights
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from popgen.methods.mappo.play_record import PlayRecord
 from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 HORIZON = 20

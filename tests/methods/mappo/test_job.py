@@ -11,7 +11,7 @@ from popgen.config.sections import EnvConfig
 from popgen.errors import UserError
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.methods.mappo.training_job import Job, policy_config
-from popgen.play.matches import Match, share_of_each
+from popgen.play.rollout import Match, share_of_each
 from popgen.types import Kind
 
 ENV = EnvConfig()

@@ -23,7 +23,7 @@ from popgen.methods.mappo.play_record import HABIT_DECAY, PlayRecord
 from popgen.methods.mappo.pooling import Plan, PooledBatch, gather, pool
 from popgen.methods.mappo.slots import SlotPool
 from popgen.methods.mappo.training_job import Job
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 OPTIONS: dict[str, Any] = {"discount": 0.5, "lam": 0.5, "value_decay": 0.0}

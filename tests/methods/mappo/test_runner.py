@@ -15,7 +15,7 @@ from popgen.methods.mappo.rl_module import module_spec
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
 from popgen.nets.weights import Weights, weights_of
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 # A small arena, which players soon leave: an episode's end.

@@ -14,7 +14,7 @@ from popgen.envs import BatchedEnv, make_env
 from popgen.envs.reward import training_reward
 from popgen.methods.mappo.slots import Rollout, SlotPool
 from popgen.nets.feed_forward import FeedForwardNet, Sizes
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 HORIZON = 12

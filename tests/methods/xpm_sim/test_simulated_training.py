@@ -10,8 +10,7 @@ import pytest
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
-from popgen.methods.training import Collected, Phase, Progress, Round, Sampled, SegmentCount, TrainedMember
-from popgen.methods.transport import Ready
+from popgen.methods.training import Collected, Phase, Progress, Ready, Round, Sampled, SegmentCount, TrainedMember
 from popgen.methods.xpm_sim.agent import make_actor
 from popgen.methods.xpm_sim.train import XpmSimTraining
 from popgen.methods.xpm_sim.workers import Learned, RestartCheck

@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from popgen.actors.checkpoint_writer import resolve_handles
-from popgen.methods.transport import InlineTransport, Ready
-from popgen.methods.xpm_wm import phase_rules as rules
+from popgen.methods.training import InlineTransport, Ready
+from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.imagination import Starts
-from popgen.methods.xpm_wm.member_progress import Candidate, FirstMemberProgress, LaterMemberProgress, MemberWeights
-from popgen.methods.xpm_wm.real_play import Tally
+from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
+from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
+from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Tally, goes_by_tally, rare_events
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
+from popgen.runs.checkpoints import resolve_handles
 from popgen.types import Kind
 
 AFTER = 0.5
@@ -35,32 +36,32 @@ def member() -> FirstMemberProgress:
 
 def play(progress: FirstMemberProgress, phase: Phase1Config, *scores: float) -> None:
     progress.add_scores(scores, scores)
-    rules.keep_best(progress, phase, AFTER)
+    phase1.keep_best(progress, phase, AFTER)
 
 
 def test_patience_begins_when_there_is_a_window_to_judge_by() -> None:
     first, phase = member(), Phase1Config(patience=3, target_score=9.0)
     for _ in range(15):
         play(first, phase, 1.0)
-        assert not rules.should_stop(first, phase) and first.since_best == 0 and first.best is None
+        assert not phase1.should_stop(first, phase) and first.since_best == 0 and first.best is None
     for waited in range(3):
         play(first, phase, 1.0)
-        assert first.since_best == waited and not rules.should_stop(first, phase)
+        assert first.since_best == waited and not phase1.should_stop(first, phase)
     play(first, phase, 1.0)
-    assert first.since_best == 3 and rules.should_stop(first, phase)
+    assert first.since_best == 3 and phase1.should_stop(first, phase)
     play(first, phase, *[2.0] * 16)
-    assert first.since_best == 0 and not rules.should_stop(first, phase)
+    assert first.since_best == 0 and not phase1.should_stop(first, phase)
 
 
 def test_the_target_needs_a_whole_window_and_the_budget_does_not() -> None:
     first, phase = member(), Phase1Config(target_score=5.0, max_steps=100)
     first.add_scores([8.0] * 15, [])
-    assert not rules.should_stop(first, phase)
+    assert not phase1.should_stop(first, phase)
     first.add_scores([8.0], [])
-    assert rules.should_stop(first, phase) and rules.reached_target(first, phase)
+    assert phase1.should_stop(first, phase) and phase1.reached_target(first, phase)
     first = member()
     first.steps = 100
-    assert rules.should_stop(first, phase) and not rules.reached_target(first, phase)
+    assert phase1.should_stop(first, phase) and not phase1.reached_target(first, phase)
 
 
 @pytest.mark.parametrize(("last", "wanted"), [(9.6, LATEST), (9.4, PLAYED)])
@@ -70,14 +71,14 @@ def test_the_last_weights_are_taken_unless_those_that_played_best_were_better(
     first, phase = member(), Phase1Config()
     play(first, phase, *[10.0] * 16)
     play(first, phase, *[last] * 16)
-    assert rules.choose_first(first).weights is wanted
+    assert phase1.choose_first(first).weights is wanted
 
 
 def test_without_a_whole_window_the_last_weights_are_all_there_is() -> None:
     first, phase = member(), Phase1Config()
-    assert rules.choose_first(first) == Candidate(LATEST, 0.0, 0.0)
+    assert phase1.choose_first(first) == Candidate(LATEST, 0.0, 0.0)
     play(first, phase, 4.0, 2.0)
-    assert rules.choose_first(first) == Candidate(LATEST, 3.0, 0.0)
+    assert phase1.choose_first(first) == Candidate(LATEST, 3.0, 0.0)
 
 
 def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_target() -> None:
@@ -95,13 +96,13 @@ def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_targ
 def test_the_last_policy_must_reach_the_target_by_itself() -> None:
     """9.69 of 10 is too little, 9.7 enough; then it is taken although the best window was another's."""
     phase = Phase1Config(target_score=10.0)
-    assert not rules.is_confirmed(9.69, 10.0) and rules.is_confirmed(9.7, 10.0)
+    assert not phase1.is_confirmed(9.69, 10.0) and phase1.is_confirmed(9.7, 10.0)
     first = member()
     play(first, phase, *[20.0] * 16)
     first.add_scores([9.7] * 16, [])
-    assert rules.choose_first(first).weights is PLAYED
+    assert phase1.choose_first(first).weights is PLAYED
     first.confirmed = True
-    chosen = rules.choose_first(first)
+    chosen = phase1.choose_first(first)
     assert chosen.weights is LATEST and chosen.sp == pytest.approx(9.7)
 
 
@@ -112,16 +113,16 @@ def test_with_a_plateau_a_member_goes_on_past_its_target_until_it_no_longer_gain
     assert (first.mark, first.since_gain, first.plays) == (0.0, 0, False)
     for score, since in ((10.0, 0), (10.1, 1), (10.19, 2), (10.2, 0), (10.2, 1), (10.2, 2)):
         play(first, phase, *[score] * 16)
-        assert (first.since_gain, rules.should_stop(first, phase)) == (since, False)
+        assert (first.since_gain, phase1.should_stop(first, phase)) == (since, False)
     play(first, phase, *[10.2] * 16)
-    assert rules.has_levelled_off(first, phase) and rules.should_stop(first, phase)
+    assert phase1.has_levelled_off(first, phase) and phase1.should_stop(first, phase)
 
 
 def test_a_member_that_does_not_play_has_not_levelled_off() -> None:
     first, phase = member(), Phase1Config(target_score=10.0, plateau=1)
     for _ in range(5):
         play(first, phase, *[4.9] * 16)
-    assert not rules.should_stop(first, phase)
+    assert not phase1.should_stop(first, phase)
 
 
 def test_a_plateaus_policy_is_measured_by_its_own_best_and_waits_anew_if_it_fails() -> None:
@@ -130,40 +131,40 @@ def test_a_plateaus_policy_is_measured_by_its_own_best_and_waits_anew_if_it_fail
         first = member()
         first.plays, first.mark, first.since_gain = True, 10.0, 2
         episodes = [Episode(Kind.SP, (1, 1), score, score)] * 16
-        assert rules.confirm_policy(first, episodes, phase) == pytest.approx(score)
-        assert first.confirmed is taken and not rules.is_done(first, phase)
+        assert phase1.confirm_policy(first, episodes, phase) == pytest.approx(score)
+        assert first.confirmed is taken and not phase1.is_done(first, phase)
 
 
 def test_a_confirmation_needs_room_in_the_budget() -> None:
     first, phase = member(), Phase1Config(envs=16, max_steps=1000)
     for steps, room in ((840, True), (841, False)):
         first.steps = steps
-        assert rules.may_confirm(first, phase, horizon=10) is room
+        assert phase1.may_confirm(first, phase, horizon=10) is room
 
 
 def test_actor_and_critics_restart_once_and_only_if_wanted() -> None:
     first = member()
-    assert not rules.restart_is_due(first, Phase1Config())
+    assert not phase1.restart_is_due(first, Phase1Config())
     phase = Phase1Config(restart_after=100, restart_updates=5)
-    assert not rules.restart_is_due(first, phase)
+    assert not phase1.restart_is_due(first, phase)
     first.steps = 100
-    assert rules.restart_is_due(first, phase)
+    assert phase1.restart_is_due(first, phase)
     first.restarted = True
-    assert not rules.restart_is_due(first, phase)
+    assert not phase1.restart_is_due(first, phase)
 
 
 @pytest.mark.parametrize(("steps", "rounds"), [(None, 7), (1_000_000, 7), (800, 5), (799, 4), (1, 1)])
 def test_rounds_of_a_later_member_end_with_its_steps(steps: int | None, rounds: int) -> None:
     phase = Phase2Config(rounds=7, max_rounds=1, max_steps=steps, episodes_sp=2)
-    assert rules.most_rounds(phase, 2, horizon=40) == rounds  # (2 + 2) episodes of 40 steps each
+    assert phase2.most_rounds(phase, 2, horizon=40) == rounds  # (2 + 2) episodes of 40 steps each
 
 
 def test_only_a_weak_member_plays_further_rounds() -> None:
     phase = Phase2Config(rounds=2, max_rounds=4, target_score=5.0)
-    assert rules.most_rounds(phase, 2, horizon=40) == 4
+    assert phase2.most_rounds(phase, 2, horizon=40) == 4
     for sp, wanted in ((4.9, 4), (5.0, 2)):
         progress = LaterMemberProgress(PartnerStrength("max_window"), best=Candidate(LATEST, sp, 0.0))
-        while rules.plays_on(progress, phase, 4):
+        while phase2.plays_on(progress, phase, 4):
             progress.rounds += 1
         assert progress.rounds == wanted
 
@@ -172,7 +173,7 @@ def test_with_a_plateau_a_later_member_goes_on_while_it_improves() -> None:
     phase = Phase2Config(rounds=2, max_rounds=6, target_score=5.0, plateau=2)
     for last_best, wanted in ((1, 3), (2, 4), (3, 5), (5, 6)):
         progress = LaterMemberProgress(PartnerStrength("max_window"), best=Candidate(LATEST, 5.0, 0.0))
-        while rules.plays_on(progress, phase, 6):
+        while phase2.plays_on(progress, phase, 6):
             progress.rounds += 1
             progress.since_best = max(0, progress.rounds - last_best)
         assert progress.rounds == wanted
@@ -181,9 +182,9 @@ def test_with_a_plateau_a_later_member_goes_on_while_it_improves() -> None:
 def test_rare_events_are_those_seen_too_seldom() -> None:
     none = np.zeros(0, np.int64)
     tally = Tally(np.array([7, 3, 0]), np.zeros(3, np.int64), 0, none, none, ())
-    assert rules.rare_events(tally, DiscoveryConfig(rare_events=4)) == (1, 2)
-    assert rules.rare_events(tally, DiscoveryConfig()) == () == rules.rare_events(None, DiscoveryConfig(rare_events=4))
-    assert not rules.goes_by_tally(DiscoveryConfig()) and rules.goes_by_tally(DiscoveryConfig(trust=2.0))
+    assert rare_events(tally, DiscoveryConfig(rare_events=4)) == (1, 2)
+    assert rare_events(tally, DiscoveryConfig()) == () == rare_events(None, DiscoveryConfig(rare_events=4))
+    assert not goes_by_tally(DiscoveryConfig()) and goes_by_tally(DiscoveryConfig(trust=2.0))
 
 
 def test_a_member_is_chosen_by_self_play_less_strongest_cross_play() -> None:
@@ -203,7 +204,7 @@ def test_a_round_moves_the_multipliers_of_the_partners_it_met() -> None:
         Episode(Kind.XP, (3, 1), 5.0, 5.0),
         Episode(Kind.XP, (2, 3), 0.0, 0.0),
     ]
-    scored = rules.judge_round(progress, LATEST, episodes, 400)
+    scored = phase2.judge_round(progress, LATEST, episodes, 400)
     assert (scored.sp, scored.xp) == (9.0, 5.0)
     assert progress.constraint.multipliers == {1: 0.75, 2: 0.5 - 0.5 / 8.0}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from popgen.methods.xpm_wm.config import WatchConfig
-from popgen.methods.xpm_wm.member_progress import Watch
+from popgen.methods.xpm_wm.real_play import Watch
 
 CONFIG = WatchConfig(imagined_factor=4.0, precision_share=0.7, precision_reports=2)
 

@@ -18,10 +18,10 @@ from popgen.methods.training import (
     Sampled,
     State,
     TrainedMember,
+    Transport,
 )
-from popgen.methods.transport import Transport
 from popgen.nets.weights import Weights
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 
@@ -122,5 +122,5 @@ class GuessTraining:
 
 
 def open_training(config: GuessRun, spec: EnvSpec, attempt: str, transport: Transport) -> GuessTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     return GuessTraining(config, spec, transport, start_samplers(config, attempt, transport))

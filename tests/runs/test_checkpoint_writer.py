@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from support.small import kitchen, random_play
 
-from popgen.actors.checkpoint_writer import CheckpointFiles, resolve_handles
-from popgen.methods.training import Segments
-from popgen.methods.transport import Ready
+from popgen.methods.training import Ready, Segments
 from popgen.methods.xpm_wm.imagination import Starts
+from popgen.runs.checkpoints import CheckpointFiles, resolve_handles
 from popgen.runs.state_files import load_state
 from popgen.types import Kind
 
@@ -77,7 +76,7 @@ def test_a_finished_member_leaves_its_large_parts_behind_handles(tmp_path: Path)
 def test_a_checkpoint_waits_for_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoints = CheckpointFiles(tmp_path, long=10, seconds=5.0)
     now = checkpoints.last
-    monkeypatch.setattr("popgen.actors.checkpoint_writer.time.monotonic", lambda: now + 4.9)
+    monkeypatch.setattr("popgen.runs.checkpoints.time.monotonic", lambda: now + 4.9)
     assert not checkpoints.due()
-    monkeypatch.setattr("popgen.actors.checkpoint_writer.time.monotonic", lambda: now + 5.0)
+    monkeypatch.setattr("popgen.runs.checkpoints.time.monotonic", lambda: now + 5.0)
     assert checkpoints.due()

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from popgen.nets.blocks import TwoHot
+from popgen.methods.xpm_wm.actor_critic import TwoHot
 
 
 def test_bins_by_hand() -> None:
