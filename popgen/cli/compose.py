@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import json
 import math
@@ -18,6 +19,9 @@ from popgen.errors import UserError
 from popgen.methods.recipe import SourcedSetting
 
 if TYPE_CHECKING:
+    from hydra.core.override_parser.types import Override
+    from omegaconf import DictConfig
+
     from popgen.config.run_config import RunConfig
 
 ALIASES = {"seed": "run.seed"}
@@ -28,6 +32,9 @@ QUOTES = "'\""
 
 CHOICES = ("method", "scale", "env")
 """Groups that decide which schema and which recipe the other settings stand on."""
+
+_COMPOSED: dict[str, DictConfig] = {}
+"""What this process has composed of conf/ and groups, by all that it depends on."""
 
 
 @dataclass(frozen=True)
@@ -248,23 +255,17 @@ def _compose(
     *,
     loose: bool = False,
 ) -> dict[str, Any]:
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from popgen.conf import DIRECTORY
-
-    _store_groups(base, folder)
-    GlobalHydra.instance().clear()
-    search = [] if folder is None else [f"hydra.searchpath=[{json.dumps(folder.as_uri())}]"]
     try:
-        with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
-            composed = hydra_compose("config", [*search, *translated])
-        missing = sorted(OmegaConf.missing_keys(composed))
-        values = OmegaConf.to_container(composed, resolve=not loose)
+        groups, fields = _split_fields(translated)
+        config = _compose_groups(base, groups, folder)
+        ConfigLoaderImpl._apply_overrides_to_config(fields, config)
+        missing = sorted(OmegaConf.missing_keys(config))
+        values = OmegaConf.to_container(config, resolve=not loose)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # the last for a number as a group's option
         raise _composition_error(error, overrides, folder, unknown) from None
     assert isinstance(values, dict)
@@ -273,13 +274,51 @@ def _compose(
     return {str(key): value for key, value in values.items()}
 
 
-def _store_groups(base: dict[str, Any], folder: Path | None) -> None:
+def _split_fields(translated: list[str]) -> tuple[list[str], list[Override]]:
+    """Words that Hydra composes by, and those that only set a field of what it composes: KEY.KEY=VALUE."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    parsed = OverridesParser.create().parse_overrides(translated)
+    groups: list[str] = []
+    fields: list[Override] = []
+    for word, one in zip(translated, parsed, strict=True):
+        if one.is_delete() or one.is_sweep_override() or not re.fullmatch(r"\w+(\.\w+)+", one.key_or_group):
+            groups.append(word)
+        else:
+            fields.append(one)
+    return groups, fields
+
+
+def _compose_groups(base: dict[str, Any], words: list[str], folder: Path | None) -> DictConfig:
+    """What Hydra composes of the schema and the groups that are chosen. It takes a tenth of a second, so that what came
+    of conf/ alone is kept: the runs of a sweep differ in fields."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    from popgen.conf import DIRECTORY
+
+    installed = _installed_options()
+    name = json.dumps([base, words, {group: sorted(options) for group, options in installed.items()}])
+    if folder is None and name in _COMPOSED:
+        return copy.deepcopy(_COMPOSED[name])
+    _store_groups(base, installed, folder)
+    GlobalHydra.instance().clear()
+    search = [] if folder is None else [f"hydra.searchpath=[{json.dumps(folder.as_uri())}]"]
+    with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
+        config = hydra_compose("config", [*search, *words])
+    if folder is None:
+        _COMPOSED[name] = copy.deepcopy(config)
+    return config
+
+
+def _store_groups(base: dict[str, Any], installed: dict[str, set[str]], folder: Path | None) -> None:
     """What Hydra composes from beside files: the schema with its recipe, and groups of what others have installed."""
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()
     store.store(name="schema", node=base)
-    for group, options in _installed_options().items():
+    for group, options in installed.items():
         for option in options - _file_options(group, folder):
             inner, _, name = f"{group}/{option}".rpartition("/")
             if group == "env":

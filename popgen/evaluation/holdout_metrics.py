@@ -99,10 +99,14 @@ def measure_cvar(values: np.ndarray, share: float = 0.2) -> float:
 
 
 def interquartile_mean(scores: np.ndarray) -> float:
-    """Mean of the middle half of all scores, in any shape."""
-    from scipy.stats import trim_mean
+    """Mean of the middle half of all scores, in any shape.
 
-    return float(trim_mean(np.asarray(scores, np.float64).ravel(), proportiontocut=0.25))
+    The same as `scipy.stats.trim_mean(scores, 0.25, axis=None)` to the bit; that takes 40 times as long, most of a
+    bootstrap's time.
+    """
+    values = np.asarray(scores, np.float64).ravel()
+    cut = int(0.25 * values.size)
+    return float(np.partition(values, (cut, values.size - cut - 1))[cut : values.size - cut].mean())
 
 
 def bootstrap_interval(

@@ -105,6 +105,16 @@ def test_seed_is_short_for_run_seed() -> None:
     assert parsed("seed=7").run.seed == 7
 
 
+def test_what_was_composed_before_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["scale=smoke", "agent.lambda_xp=0.3", "env.params.cooking=auto", "seed=4"]
+    before = compose(words)
+    before["agent"]["units"] = before["env"]["params"]["cooking"] = "changed by the caller"
+    again, other = compose(words), compose(words[:1])
+    monkeypatch.setattr("popgen.cli.compose._COMPOSED", {})
+    assert again == compose(words) and other == compose(words[:1])
+    assert (again["run"]["seed"], again["agent"]["lambda_xp"], again["env"]["params"]["cooking"]) == (4, 0.3, "auto")
+
+
 def test_dictionaries_take_new_keys_without_a_sign() -> None:
     config = parsed("env.params.grid='XXPXX/O1 2O/X   X/XDXSX'", "cluster.resources.gpu_node=1")
     assert config.env.params["grid"] == "XXPXX/O1 2O/X   X/XDXSX"

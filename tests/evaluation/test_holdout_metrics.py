@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import trim_mean
 
 from popgen.evaluation.holdout_metrics import (
     bootstrap_interval,
@@ -52,6 +53,12 @@ def test_cvar_is_the_mean_of_the_lowest_share(share: float, value: float) -> Non
 
 def test_the_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
     assert interquartile_mean(np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])) == 3.5  # 2 3 4 5
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 33])
+def test_the_interquartile_mean_is_scipys(count: int) -> None:
+    scores = np.random.default_rng(count).normal(size=(3, count)).round(1)
+    assert interquartile_mean(scores) == trim_mean(scores, 0.25, axis=None)
 
 
 def test_the_interval_holds_the_estimate_and_is_seeded() -> None:

@@ -11,6 +11,7 @@ import collections
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,11 +38,17 @@ def list_sources(root: Path, *folders: str) -> list[Path]:
     return sorted(path for folder in folders or TOP for path in (root / folder).rglob("*.py") if path.is_file())
 
 
+@cache
+def parse_file(path: Path) -> ast.Module:
+    """The syntax tree of a file, which all bars share."""
+    return ast.parse(path.read_text())
+
+
 def parse_sources(root: Path, *folders: str) -> Iterator[tuple[str, ast.Module]]:
     """(name relative to the root, syntax tree) of every file."""
     for path in list_sources(root, *folders):
         if not any(parent.is_symlink() for parent in path.relative_to(root).parents if str(parent) != "."):
-            yield str(path.relative_to(root)), ast.parse(path.read_text())
+            yield str(path.relative_to(root)), parse_file(path)
 
 
 def iter_functions(root: Path, *folders: str) -> Iterator[tuple[str, Function]]:

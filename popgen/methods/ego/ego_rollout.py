@@ -177,7 +177,7 @@ class EgoSampler:
         return {view: self.env.encode(states, view) for view in self._views}
 
     @property
-    def _list_seats(self) -> np.ndarray:
+    def _row_seats(self) -> np.ndarray:
         """(R,) the ego's seat in each row."""
         if self.company.seats is None:
             return np.tile(np.arange(self.env.spec.num_players), self.env.num_envs)
@@ -185,7 +185,7 @@ class EgoSampler:
 
     def _judge(self, columns: dict[str, list[Any]], seen: dict[str, np.ndarray]) -> None:
         """What critics look at: the joint features from the row's seat, and who plays."""
-        seats, rows, features = self._list_seats, self.env_of_row, seen["features"]
+        seats, rows, features = self._row_seats, self.env_of_row, seen["features"]
         judged = [_pick_rows(features, rows, seats)]
         if self._copies == 2:
             judged.append(_pick_rows(features, rows, 1 - seats))
@@ -198,7 +198,7 @@ class EgoSampler:
     def _choose_actions(self, columns: dict[str, list[Any]], seen: dict[str, np.ndarray], *, fresh: bool) -> np.ndarray:
         """The ego's actions (R,), and all that is kept of this choice."""
         self._judge(columns, seen)
-        net, seats, rows = self.net, self._list_seats, self.env_of_row
+        net, seats, rows = self.net, self._row_seats, self.env_of_row
         obs = _pick_rows(seen[net.sizes.view], rows, seats)
         own, other = (_pick_rows(self._previous, rows, s).long() for s in (seats, 1 - seats))
         first = torch.from_numpy(self._first[self.env_of_row])

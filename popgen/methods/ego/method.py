@@ -1,17 +1,26 @@
 """Ego agents as the rest of the house knows them."""
 
+from functools import partial
+
 from popgen.methods.ego.config import BrRun, FcpRun, HiptRun, SpAugRun, SpRun
 from popgen.methods.ego.needs import check_run, estimate_needs, list_actors
 from popgen.methods.ego.recipes import ALONE_RECIPES, BR_RECIPES, FLAT_RECIPES, HIPT_RECIPES
 from popgen.methods.method import Method
 
-_TRAINING = "popgen.actors.ego_workers:open_training"
-_POLICIES = {
-    "ego": "popgen.methods.ego.ego_policy:EgoPolicy",
-    "hierarchical_ego": "popgen.methods.ego.ego_policy:HierarchicalEgoPolicy",
-}
+_make_ego = partial(
+    Method,
+    training="popgen.actors.ego_workers:open_training",
+    actors=list_actors,
+    needs=estimate_needs,
+    check=check_run,
+    policies={
+        "ego": "popgen.methods.ego.ego_policy:EgoPolicy",
+        "hierarchical_ego": "popgen.methods.ego.ego_policy:HierarchicalEgoPolicy",
+    },
+    trains_ego=True,
+)
 
-HIPT = Method(
+HIPT = _make_ego(
     name="hipt",
     title="HiPT",
     summary="An ego of two levels beside a population: a z for some steps, and actions under it.",
@@ -19,15 +28,9 @@ HIPT = Method(
     marker="P",
     config=HiptRun,
     recipes=HIPT_RECIPES,
-    training=_TRAINING,
-    actors=list_actors,
-    needs=estimate_needs,
-    check=check_run,
-    policies=_POLICIES,
-    trains_ego=True,
 )
 
-FCP = Method(
+FCP = _make_ego(
     name="ego_fcp",
     title="FCP ego",
     summary="A recurrent ego of one level beside a population.",
@@ -35,15 +38,9 @@ FCP = Method(
     marker="X",
     config=FcpRun,
     recipes=FLAT_RECIPES,
-    training=_TRAINING,
-    actors=list_actors,
-    needs=estimate_needs,
-    check=check_run,
-    policies=_POLICIES,
-    trains_ego=True,
 )
 
-BR = Method(
+BR = _make_ego(
     name="br",
     title="BR",
     summary="The best response to one partner.",
@@ -51,15 +48,9 @@ BR = Method(
     marker="<",
     config=BrRun,
     recipes=BR_RECIPES,
-    training=_TRAINING,
-    actors=list_actors,
-    needs=estimate_needs,
-    check=check_run,
-    policies=_POLICIES,
-    trains_ego=True,
 )
 
-SP = Method(
+SP = _make_ego(
     name="sp",
     title="SP",
     summary="A recurrent ego in self-play: a control.",
@@ -67,15 +58,9 @@ SP = Method(
     marker=">",
     config=SpRun,
     recipes=ALONE_RECIPES,
-    training=_TRAINING,
-    actors=list_actors,
-    needs=estimate_needs,
-    check=check_run,
-    policies=_POLICIES,
-    trains_ego=True,
 )
 
-SP_AUG = Method(
+SP_AUG = _make_ego(
     name="sp_aug",
     title="SP-aug",
     summary="A recurrent ego in self-play from augmented start states: a control.",
@@ -83,10 +68,4 @@ SP_AUG = Method(
     marker="p",
     config=SpAugRun,
     recipes=ALONE_RECIPES,
-    training=_TRAINING,
-    actors=list_actors,
-    needs=estimate_needs,
-    check=check_run,
-    policies=_POLICIES,
-    trains_ego=True,
 )
