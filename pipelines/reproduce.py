@@ -93,7 +93,8 @@ def _measure_run(pieces: Pieces, job: Job, name: str) -> None:
     if missing := [title for title, folder in holdouts.items() if not is_finished(folder)]:
         raise UserError(name, f"needs {missing[0]}", "finish that run first")
     episodes, people = pieces.plan.budget.episodes, _gather_study(pieces, job)
-    figures = MEASURES[name](RunToMeasure(job.folder, job.wanted.row, episodes, holdouts, people))
+    humans, search = pieces.plan.out / "humans", pieces.plan.budget.proxy
+    figures = MEASURES[name](RunToMeasure(job.folder, job.wanted.row, episodes, holdouts, people, humans, search))
     values = {"run": str(job.folder), "episodes": episodes, "figures": round_figures(jsonable(figures))}
     write_json(pieces.find_measured(job, name), values)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from popgen.evaluation.holdout import Casting, evaluate_holdout
 from popgen.evaluation.holdout_players import check_disjoint, open_sides
 from popgen.evaluation.partner_diversity import measure_partners
 from popgen.evaluation.played_games import PlayedGame, count_members, count_people
+from popgen.humans.humans_report import population_folder
+from popgen.humans.proxies import ProxySearch, fit_population
 from popgen.humans.recordings import LAYOUTS, load_games
 from popgen.pipelines.compare import HELD_SEED
 from popgen.pipelines.experiments import describe_population, measure_source, open_sources
@@ -53,6 +56,8 @@ class RunToMeasure:
         episodes: of every evaluation.
         holdouts: title -> folder of a run whose population an ego is held against.
         people: the study in which simulated people play with the ego.
+        humans: folder of human proxies, which are fitted there once.
+        proxy: of the search for one, as the budget says.
     """
 
     folder: Path
@@ -60,6 +65,8 @@ class RunToMeasure:
     episodes: int
     holdouts: Mapping[str, Path]
     people: StudyToSimulate | None = None
+    humans: Path = Path("humans")
+    proxy: Mapping[str, int] = field(default_factory=dict)
 
 
 def measure_scores(job: RunToMeasure) -> dict[str, Any]:
@@ -204,6 +211,34 @@ def measure_ego(job: RunToMeasure) -> dict[str, Any]:
     return {**means, "average": float(np.mean(list(means.values()))), "worst": worst}
 
 
+def measure_human(job: RunToMeasure) -> dict[str, Any]:
+    """Score of an ego beside a clone of the people whose games are held out; nothing where none were recorded."""
+    layout = read_run(job.folder).environment.name.partition("/")[2]
+    if layout not in LAYOUTS:
+        return {}
+    wanted = {"ego": [("ego", str(job.folder))], "partner": [("people", str(find_proxy(job, layout)))]}
+    opened = open_sides(wanted, title_of)
+    environment = opened.environment
+
+    def make(num_envs: int, seed: int) -> Any:
+        return make_env(environment.name, num_envs, seed=seed, **environment.params)
+
+    casting = Casting(opened.sides["ego"], opened.sides["partner"])
+    report = to_dict(evaluate_holdout(casting, environment, make, job.episodes, SEED))
+    return {"score": next(one["mean"] for one in report["standings"] if one["partners"] == "people")}
+
+
+def find_proxy(job: RunToMeasure, layout: str) -> Path:
+    """The population of a layout's proxy of half B; fitted where it is not there yet."""
+    path = population_folder(job.humans, layout, "B")
+    if not path.is_dir():
+        unfinished = path.with_name(f".{path.name}")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        fit_population(unfinished, layout, "B", seed=SEED, search=ProxySearch(**job.proxy))
+        unfinished.rename(path)
+    return path
+
+
 def measure_conventions(job: RunToMeasure) -> dict[str, Any]:
     """How members' dishes go with what they do, pooled as in the paper, and how near they come to recorded people; of
     an ego, how the dishes of simulated people beside it go with what those do."""
@@ -235,6 +270,7 @@ MEASURES: dict[str, Callable[[RunToMeasure], dict[str, Any]]] = {
     "diversity": measure_diversity,
     "acting": measure_acting,
     "holdout": measure_ego,
+    "human": measure_human,
     "conventions": measure_conventions,
 }
 """Name -> measure."""

@@ -39,8 +39,9 @@ FINAL_SKILL = "final"
 SKILLS = ("initial", "half", FINAL_SKILL)
 """Of the members of a seed of FCP, in order."""
 
-BIASED_ROLE, PARTNER_ROLE = "biased", "partner"
-"""`extra.role` of the members of pairs: who wants something of its own, and who learned to play beside it."""
+BIASED_ROLE, CONFEDERATE_ROLE, PARTNER_ROLE = "biased", "confederate", "partner"
+"""`extra.role` of the members of pairs: who wants something of its own, who wants no other best response, and who
+learned to play beside either."""
 
 POPULATION = 0
 """Who stands for all members in the ledger: the final evaluation is nobody's own."""

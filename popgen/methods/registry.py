@@ -37,6 +37,7 @@ BUILT_IN: dict[str, str] = {
     "trajedi": "popgen.methods.mappo.method:TRAJEDI",
     "hsp": "popgen.methods.mappo.method:HSP",
     "bp": "popgen.methods.mappo.method:BP",
+    "brdiv": "popgen.methods.mappo.method:BRDIV",
     "e3t": "popgen.methods.mappo.method:E3T",
     "hipt": "popgen.methods.ego.method:HIPT",
     "ego_fcp": "popgen.methods.ego.method:FCP",

@@ -286,6 +286,24 @@ def test_a_weight_of_zero_is_mappo_bit_for_bit(root: Path) -> None:
         assert run.ledger() == plain.ledger(), method
 
 
+def test_brdiv_keeps_pairs_and_counts_their_cross_play(root: Path) -> None:
+    """Two pairs; killed between two members, it ends the same. Cross-play of 4 environments a confederate counts for
+    it, the pair's own play for its best response."""
+    overrides = ("method=brdiv", "population.size=4")
+    whole = launch(root, "brdiv", *overrides)
+    with pytest.raises(Killed):
+        launch(root, "brdiv_again", *overrides, die_at="added:1")
+    again = launch(root, "brdiv_again", *overrides)
+    assert again.sha256s() == whole.sha256s() and again.ledger() == whole.ledger()
+    extra = [whole.population.info(member).extra for member in (1, 2, 3, 4)]
+    assert [(one["role"], one["pair"]) for one in extra] == [
+        *(("confederate", 1), ("partner", 1)),
+        *(("confederate", 2), ("partner", 2)),
+    ]
+    own, crossed = {(m, "SP"): SP_STEPS for m in (2, 4)}, {(m, "XP"): SP_STEPS for m in (1, 3)}
+    assert whole.counted() == own | crossed and whole.counted().total() == whole.said.total()
+
+
 def test_hsp_keeps_pairs_with_their_roles_and_counts_the_whole_pool(root: Path) -> None:
     """One pair of three, evenly counted; killed at the second iteration, or between two members, it ends the same."""
     overrides = ("method=hsp", "population.size=2", "hsp.pool=3")

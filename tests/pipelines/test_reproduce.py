@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -180,3 +181,22 @@ def test_measures_of_a_finished_run(tmp_path: Path) -> None:
     assert run_measures.measure_diversity(job)["effective_rank"] >= 1.0
     assert run_measures.measure_acting(job) == {}  # random players tell no probabilities
     assert run_measures.round_figures({"a": [1.23456789, 2]}) == {"a": [1.23457, 2]}
+
+
+def test_an_ego_is_measured_beside_the_clone_of_people_that_is_fitted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ego is a random player here, and so is the clone; an interrupted fit is done again."""
+    folder = finished_run(tmp_path, "one", [{"SP": 10}])
+    asked: list[tuple[str, str, int]] = []
+
+    def fit(path: Path, layout: str, half: str, *, seed: int, search: Any) -> None:
+        asked.append((layout, half, search.drawn))
+        shutil.copytree(folder / "population", path)
+
+    monkeypatch.setattr(run_measures, "fit_population", fit)
+    (tmp_path / "humans" / ".cramped_room_B").mkdir(parents=True)
+    job = RunToMeasure(folder, "XPM-WM", 2, {}, humans=tmp_path / "humans", proxy={"drawn": 3})
+    assert run_measures.measure_human(job)["score"] >= 0.0 and run_measures.measure_human(job)["score"] < 2.0
+    assert asked == [("cramped_room", "B", 3)]
+    assert [path.name for path in (tmp_path / "humans").iterdir()] == ["cramped_room_B"]

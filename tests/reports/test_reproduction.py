@@ -97,6 +97,20 @@ def test_the_table_of_sabotage_has_every_objective_and_the_generators_every_meth
     assert rows == {method.title for method in METHODS.values() if not method.trains_ego}
 
 
+def test_every_generator_has_an_ego_beside_the_same_holdouts_and_people() -> None:
+    runs = TARGETS["generators"].list_runs(BUDGETS["laptop"], [1, 2])
+    egos = [one for one in runs if one.teacher is not None]
+    assert len(egos) == len(runs) / 2 and all(set(one.measures) == {"holdout", "human"} for one in egos)
+    for seed in (1, 2):
+        for layout in BUDGETS["laptop"].layouts:
+            holdouts = {one.holdouts for one in egos if one.seed == seed and f"env={layout}" in one.teacher.words}
+            assert len(holdouts) == 1 and {other.seed for other in next(iter(holdouts))} == {3 - seed}
+    figures = {column.figure for column in TARGETS["generators"].columns}
+    wanted = ("scores.sp", "scores.xp", "scores.mixed", "scores.obstructed", "diversity.log_determinant")
+    wanted += ("diversity.effective_rank", "conventions.nearest", "holdout.average", "human.score")
+    assert {*wanted, "costs.real", "costs.minutes"} <= figures
+
+
 def test_an_ego_is_held_against_populations_that_it_never_met() -> None:
     for seeds in ((1, 2, 3), (1,)):
         for one in TARGETS["ego"].list_runs(BUDGETS["laptop"], seeds):

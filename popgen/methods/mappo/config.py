@@ -222,6 +222,33 @@ class BpRun(BaselineRun):
     """Utilities, pool and choice."""
 
 
+class BrdivConfig(Schema):
+    """Best-response diversity (Rahman et al. 2023): pairs of a confederate and its best response."""
+
+    alpha: Weight = 1.0
+    """Weight of every difference between a pair's own return and its cross-play with another pair (eq. BRDiv); 0 leaves
+    the pairs' own returns."""
+    members: Literal["both", "confederates"] = "both"
+    """Who of a pair becomes a member; `both`: the confederate, then its best response, two members a pair."""
+    warmup: NonNegative = 10
+    """Iterations over which cross-play's weight rises in a straight line from 0; 0: full weight at once."""
+    xp_envs: Annotated[_Int, Field(ge=2, le=100_000, multiple_of=2)] = 32
+    """Environments of a confederate with another's best response, half of them in each seating."""
+    xp_clip: Weight = 0.0
+    """Cross-play's advantages are bounded at so many spreads of self-play's; 0: not bounded."""
+    target_xp: Weight = 2.0
+    """Largest mean cross-play score, of any two pairs, at which `ppo.target_score` may end the training."""
+
+
+class BrdivRun(BaselineRun):
+    """A run of BRDiv."""
+
+    method: Literal["brdiv"] = "brdiv"
+    """Pairs of a confederate and its best response, good together and bad across."""
+    brdiv: BrdivConfig = BrdivConfig()
+    """Objective, cross-play and members."""
+
+
 class PartnerRun(BaselineRun):
     """What the runs of baselines that meet partners have."""
 

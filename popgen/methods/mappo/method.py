@@ -2,6 +2,7 @@
 
 from popgen.methods.mappo.config import (
     BpRun,
+    BrdivRun,
     ComediRun,
     E3tRun,
     FcpRun,
@@ -12,10 +13,12 @@ from popgen.methods.mappo.config import (
     TrajediRun,
 )
 from popgen.methods.mappo.needs import (
+    check_brdiv,
     check_comedi,
     check_fcp,
     check_hsp,
     check_view,
+    estimate_brdiv,
     estimate_comedi,
     estimate_hsp,
     estimate_lipo,
@@ -25,6 +28,7 @@ from popgen.methods.mappo.needs import (
 )
 from popgen.methods.mappo.recipes import (
     BP_RECIPES,
+    BRDIV_RECIPES,
     COMEDI_OBJECTIVES,
     COMEDI_RECIPES,
     HSP_RECIPES,
@@ -149,6 +153,21 @@ BP = Method(
     actors=list_actors,
     needs=estimate_hsp,
     check=check_hsp,
+    multiple=2,
+)
+
+BRDIV = Method(
+    name="brdiv",
+    title="BRDiv",
+    summary="Pairs of a confederate and its best response, good together and bad with all others', on RLlib's MAPPO.",
+    colour="#AA4499",
+    marker="<",
+    config=BrdivRun,
+    recipes=BRDIV_RECIPES,
+    training="popgen.methods.mappo.brdiv:open_training",
+    actors=list_actors,
+    needs=estimate_brdiv,
+    check=check_brdiv,
     multiple=2,
 )
 

@@ -9,9 +9,20 @@ import numpy as np
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.byte_counts import FLOAT, count_numbers
-from popgen.methods.mappo.config import BaselineRun, BpRun, ComediRun, FcpRun, HspConfig, HspRun, LipoRun, PpoConfig
+from popgen.methods.mappo.config import (
+    BaselineRun,
+    BpRun,
+    BrdivConfig,
+    BrdivRun,
+    ComediRun,
+    FcpRun,
+    HspConfig,
+    HspRun,
+    LipoRun,
+    PpoConfig,
+)
 from popgen.methods.method import ActorDemand, Needs, ask_for
-from popgen.types import BIASED_ROLE, PARTNER_ROLE, SKILLS
+from popgen.types import BIASED_ROLE, CONFEDERATE_ROLE, PARTNER_ROLE, SKILLS
 
 
 def list_actors(config: BaselineRun) -> list[ActorDemand]:
@@ -72,6 +83,35 @@ def check_hsp(config: HspRun | BpRun, spec: EnvSpec) -> None:
         raise UserError("population.size", problem, f"set it to {size + 1}")
     if size // each > config.hsp.pool:
         raise UserError("hsp.pool", f"is {config.hsp.pool}, of which {size // each} are to be chosen", "raise it")
+    if config.ppo.envs < 2:
+        raise UserError("ppo.envs", "a pair plays in two seatings", "set it to at least 2")
+
+
+def list_pair_roles(brdiv: BrdivConfig) -> tuple[str, ...]:
+    """Of the members that a pair of BRDiv gives, in order."""
+    return (CONFEDERATE_ROLE, PARTNER_ROLE) if brdiv.members == "both" else (CONFEDERATE_ROLE,)
+
+
+def estimate_brdiv(config: BrdivRun, spec: EnvSpec) -> Needs:
+    """Bytes of all pairs at once, two policies each, and of their cross-play."""
+    pairs = config.population.size // len(list_pair_roles(config.brdiv))
+    environments = pairs * config.ppo.envs + pairs * (pairs - 1) * config.brdiv.xp_envs
+    return _estimate(config, spec, critics=pairs, environments=environments, together=2 * pairs)
+
+
+def check_brdiv(config: BrdivRun, spec: EnvSpec) -> None:
+    """The view, and at least two whole pairs.
+
+    Raises:
+        UserError: a view that the environment does not have, half a pair, or a single one.
+    """
+    check_view(config, spec)
+    size, each = config.population.size, len(list_pair_roles(config.brdiv))
+    if size % each:
+        problem = f"{size} is no multiple of {each}: each pair gives a confederate and its best response"
+        raise UserError("population.size", problem, f"set it to {size + 1}")
+    if size < 2 * each:
+        raise UserError("population.size", f"{size} leaves a pair nobody to differ from", f"set it to {2 * each}")
     if config.ppo.envs < 2:
         raise UserError("ppo.envs", "a pair plays in two seatings", "set it to at least 2")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,18 +86,24 @@ class PlayRecord:
 
     def plan(self, member: int, rounds: int) -> Plan:
         """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`. The partner
-        is the strongest or, under a constraint, drawn in proportion to the multipliers."""
+        is the strongest or, under a constraint, drawn in proportion to the multipliers; or all share the weight."""
         diversity, partners, mate = self.job.diversity, self.job.partners(member), self.job.mate_of(member)
+        own = Plan(mate=None if mate == member else mate)
         if diversity is None or not partners:
-            return Plan(mate=None if mate == member else mate)
+            return own
         weight = linear(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
+        if self.job.all_partners:
+            first, *others = partners
+            each = weight / len(partners)
+            return replace(own, partner=first, others=tuple(others), lambda_xp=each, xp_clip=diversity.xp_clip)
         if diversity.xp_limit is None:
             strength = self.partners[member].scores()
             partner = any_then_strongest(partners, strength, diversity.partner_random, self.rng)
         else:
             constraint = self._move_multipliers(member, rounds)
             partner, weight = constraint.draw_partner(partners, self.rng), weight * constraint.pressure(partners)
-        return Plan(partner, weight, diversity.lambda_mp if self.job.mixed else 0.0, diversity.xp_clip)
+        mixed = diversity.lambda_mp if self.job.mixed else 0.0
+        return replace(own, partner=partner, lambda_xp=weight, lambda_mp=mixed, xp_clip=diversity.xp_clip)
 
     def _move_multipliers(self, member: int, rounds: int) -> PartnerConstraint:
         """The constraint after the latest scores: of every iteration, or of fresh episodes where these decide."""

@@ -32,20 +32,22 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class Plan:
-    """What a member is trained on in one iteration: its own play, and cross-play and mixed play with one partner. Its
-    own play is with itself unless `mate` has the other seat."""
+    """What a member is trained on in one iteration: its own play, cross-play and mixed play with one partner, and
+    cross-play with `others`. Its own play is with itself unless `mate` has the other seat."""
 
     partner: int | None = None
     lambda_xp: float = 0.0
     lambda_mp: float = 0.0
     xp_clip: float = 0.0
     mate: int | None = None
+    others: tuple[int, ...] = ()
 
     def sources(self, member: int) -> list[tuple[Kind, int, float]]:
         """(kind, partner, weight), self-play first."""
         sources = [(Kind.SP, member if self.mate is None else self.mate, 1.0)]
         if self.partner is not None:
             sources += [(Kind.XP, self.partner, self.lambda_xp), (Kind.MP, self.partner, self.lambda_mp)]
+        sources += [(Kind.XP, other, self.lambda_xp) for other in self.others]
         return [source for source in sources if source[2] > 0.0]
 
 
@@ -209,13 +211,14 @@ def pool(
     """One member's batch; None where it played no self-play (a runner was lost). Each critic takes its returns into its
     statistics. `utility` pays in the reward's place, `bonus` (T, N) on top.
     """
-    own, parts, rows, figures = None, [], {}, {}
+    own, parts, rows = None, [], {}
+    sums: dict[str, list[float]] = {}  # with several partners of a kind, figures are means over them
     for kind, partner, weight in plan.sources(member):
         played, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
         if played is None or not bool(played.trained.any()):
             continue
         counted, label = played.trained.any(-1), str(kind).lower()
-        figures[f"{label}_reward"] = float(played.steps.reward[counted].mean())
+        figures = {f"{label}_reward": float(played.steps.reward[counted].mean())}
         if kind is Kind.SP:
             played = _change_reward(played, utility, bonus, figures)
         critic = critics[name]
@@ -239,10 +242,12 @@ def pool(
             f"{label}_advantage_std": float(chosen.std(correction=0)),
             f"{label}_explained": _explained_share(chosen, returns[counted]),
         }
+        for figure, value in figures.items():
+            sums.setdefault(figure, []).append(value)
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return PooledBatch(**joined, critics=rows, figures=figures)
+    return PooledBatch(**joined, critics=rows, figures={name: sum(all_) / len(all_) for name, all_ in sums.items()})
 
 
 def _change_reward(

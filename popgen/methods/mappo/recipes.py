@@ -150,6 +150,20 @@ def _with_pairs(own: Settings) -> dict[str, Recipe]:
     }
 
 
+def _with_crossed_pairs() -> dict[str, Recipe]:
+    """MAPPO's recipes for pairs that meet each other: at least two."""
+    small = {"smoke": {"brdiv.warmup": 2, "brdiv.xp_envs": 4}, "demo": {"brdiv.target_xp": 3.0}}
+    return {
+        base.name: Recipe(
+            base.name,
+            base.summary,
+            {"population.size": max(4, _PAIRED[base.name]), **small.get(base.name, {})},
+            base=base,
+        )
+        for base in RECIPES.values()
+    }
+
+
 _PAIRED = {"laptop": 8, "demo": 2, "paper": 8, "smoke": 2}
 """Members, two of a pair."""
 
@@ -183,3 +197,5 @@ LIPO_OBJECTIVES, COMEDI_OBJECTIVES = _objectives(0.25), _objectives(0.5)
 HSP_RECIPES = _with_pairs({"hsp.select": because("events", "the paper's: the biased agents do different things")})
 
 BP_RECIPES = _with_pairs({"hsp.select": because("responses", "ZSC-Eval's: their best responses do different things")})
+
+BRDIV_RECIPES = _with_crossed_pairs()

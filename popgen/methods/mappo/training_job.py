@@ -33,6 +33,7 @@ class Job:
             or -m for the member's own policy with random actions among its own.
         utilities: learning member -> what it is paid in the training reward's place.
         noise: share of the random actions.
+        all_partners: cross-play with every partner is trained on in each iteration, not with one of them.
     """
 
     env: EnvConfig
@@ -47,6 +48,7 @@ class Job:
     pairs: Mapping[int, int] = field(default_factory=dict)
     utilities: Mapping[int, Utility] = field(default_factory=dict)
     noise: float = 0.0
+    all_partners: bool = False
 
     @property
     def owners(self) -> list[int]:
@@ -64,16 +66,19 @@ class Job:
         return self.pairs.get(member, member) if owner == member else owner
 
     def partners(self, member: int) -> list[int]:
-        """Whom a learning member meets in cross-play."""
+        """Whom a learning member meets in cross-play: of pairs, those in its mate's place in the others."""
         if self.diversity is None:
             return []
+        if self.pairs:
+            places = self.pairs.values() if member in self.pairs else self.pairs
+            return sorted({*places} - {self.mate_of(member)})
         return sorted({*self.frozen, *self.learning} - {member})
 
     def matches(self) -> list[Match]:
         """All environments: self-play of every member, cross-play and mixed play of every pair in both seatings.
 
         Where two members learn together, their cross-play trains both; its steps are the later member's, as if it had
-        been added to a population of the earlier ones.
+        been added to a population of the earlier ones (of pairs, the second's).
         """
         matches = [match for member in self.owners for match in self._own_play(member)]
         if self.diversity is None:

@@ -141,21 +141,29 @@ def list_study_rows(budget: Budget, seed: int) -> list[WantedRun]:
 def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     """A row for each method that makes populations, in which the egos that they taught stand too."""
     labels = [name for name, method in METHODS.items() if not method.trains_ego]
-    populations = want_runs(budget, seeds, labels, budget.layouts, [SCORES, COSTS, "diversity", "acting"])
-    return [*populations, *list_egos(budget, seeds)]
+    measures = [SCORES, COSTS, "diversity", "acting", "conventions"]
+    populations = want_runs(budget, seeds, labels, budget.layouts, measures)
+    return [*populations, *train_egos(budget, seeds, labels, ("holdout", "human"))]
 
 
 def list_egos(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
-    """An ego for each method's population, held against all methods' populations of another seed."""
+    """An ego for each of the paper's methods."""
+    return train_egos(budget, seeds, TEACHERS, ("holdout",))
+
+
+def train_egos(
+    budget: Budget, seeds: Sequence[int], labels: Sequence[str], measures: tuple[str, ...]
+) -> list[WantedRun]:
+    """An ego for each label's population, held against the populations of the paper's methods of another seed."""
     found = []
     for place, seed in enumerate(seeds):
         other = seeds[(place + 1) % len(seeds)] if len(seeds) > 1 else seed + 1
         for name in budget.layouts:
-            teachers = want_runs(budget, [seed], TEACHERS, [name], [SCORES])
+            teachers = want_runs(budget, [seed], labels, [name], [SCORES])
             holdouts = tuple(want_runs(budget, [other], TEACHERS, [name], [SCORES]))
             for teacher in teachers:
                 words = (f"method={EGO}", f"scale={budget.scale}")
-                found.append(WantedRun(teacher.row, words, seed, ("holdout",), teacher, holdouts))
+                found.append(WantedRun(teacher.row, words, seed, measures, teacher, holdouts))
     return found
 
 

@@ -46,6 +46,7 @@ class Budget:
         rendezvous: the same of runs on rendezvous alone.
         inline: runs that can do without Ray do.
         minutes: that a run takes, until one of its kind has been measured.
+        proxy: of the search for a human proxy (`popgen.humans.proxies.ProxySearch`), where it is shorter.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Budget:
     minutes: float = 15.0
     inline: bool = False
     study: StudyBudget = StudyBudget(participants=40, pairs=2)
+    proxy: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

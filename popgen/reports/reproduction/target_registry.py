@@ -28,6 +28,7 @@ BUDGETS = {
         minutes=0.2,
         inline=True,
         study=StudyBudget(participants=3, pairs=1, tutorials=1, steps=40, random_keys=True),
+        proxy={"drawn": 2, "rounds": 0, "episodes": 2, "final_episodes": 2},
     ),
     "laptop": Budget(
         "laptop",
@@ -265,13 +266,23 @@ TARGETS = {
                 Column("effective rank", "diversity.effective_rank", 1),
                 Column("entropy of the mean policy", "acting.entropy", 2),
                 Column("divergence of trajectories", "acting.trajectories", 2),
+                Column("nearest to people", "conventions.nearest"),
+                Column("of the average person", "conventions.average"),
                 *_COSTS,
                 Column("its ego, average", "holdout.average"),
+                Column("its ego, worst pair", "holdout.worst"),
+                Column("its ego beside people's clone", "human.score"),
             ),
             "draw_bars",
             (SP, XP),
             paper_lines.list_score_lines,
-            ("Egos are trained for the populations of the paper's three methods; they stand in those rows.",),
+            (
+                "Egos of all populations are held against the same: populations of the next seed of the paper's three "
+                "methods, and a clone of the people whose games are held out. Steps count discarded runs. Members of "
+                "pairs (HSP, BP, BRDiv) are not meant to play with themselves.",
+                "Nearest to people: as in the table of conventions; populations cover people only below the average "
+                "person.",
+            ),
         ),
     )
 }

@@ -47,6 +47,19 @@ def test_a_later_member_meets_frozen_ones_in_both_seats() -> None:
     assert job.critics(3) == ["SP", "XP_1", "XP_2", "MP_1", "MP_2"]
 
 
+def test_confederates_meet_the_best_responses_of_others_alone() -> None:
+    """Three pairs: 1 to 3 are best responses, 4 to 6 their confederates."""
+    job = Job(ENV, PPO, DIVERSITY, (1, 2, 3, 4, 5, 6), seed=0, pairs={1: 4, 2: 5, 3: 6}, all_partners=True)
+    assert [job.partners(member) for member in (1, 2, 5)] == [[5, 6], [4, 6], [1, 3]]
+    cross = [entry for entry in summary(job) if entry[0] == "XP"]
+    wanted = {(best, confederate) for best in (1, 2, 3) for confederate in (4, 5, 6) if confederate != best + 3}
+    assert {members for _, members, *_ in cross} == wanted | {(b, a) for a, b in wanted} and len(cross) == 12
+    assert all(envs == 3 and owner == max(members) for _, members, envs, owner in cross)
+    own = [members for kind, members, *_ in summary(job) if kind == "SP"]
+    assert own == [(1, 4), (4, 1), (2, 5), (5, 2), (3, 6), (6, 3)]
+    assert job.critics(5) == ["SP", "XP_1", "XP_3"]
+
+
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
 def test_parts_have_every_environment_once(parts: int) -> None:
     groups = [Match(Kind.SP, (1, 1), 10, 1), Match(Kind.XP, (1, 2), 3, 2), Match(Kind.XP, (2, 1), 1, 2)]
