@@ -15,6 +15,7 @@ from popgen.config.sections import ClusterConfig, EnvConfig
 from popgen.envs import make_env
 from popgen.methods.mappo.algorithm import MappoConfig
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
+from popgen.methods.mappo.play_record import PlayRecord
 from popgen.methods.mappo.pooled_learner import PooledLearner
 from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.rl_module import MemberModule, module_spec
@@ -264,3 +265,18 @@ def test_a_learner_that_asks_for_a_card_gets_one() -> None:
     config = MappoConfig.of(job, SPEC, ClusterConfig(agent_gpus=1.0))
     config.validate()
     assert config.num_gpus_per_learner == 1 and config.num_learners == 0
+
+
+def test_of_pairs_that_meet_everyone_learns_from_its_own_play_and_from_all_others() -> None:
+    """Two pairs: best responses 1 and 2, confederates 3 and 4; steps by their owners."""
+    ppo = PPO.model_copy(update={"envs": 4})
+    job = Job(ENV, ppo, CROSS, (1, 2, 3, 4), seed=3, pairs={1: 3, 2: 4}, all_partners=True)
+    made = learner(job)
+    before, record = {m: copies(made._module_of(m)) for m in job.learning}, PlayRecord(job)
+    rollout = sampled(job, actors(made))
+    update(made, [rollout], {member: record.plan(member, 100) for member in job.learning})
+    for member, other in ((1, 4), (2, 3), (3, 2), (4, 1)):
+        assert moved(made._module_of(member), before[member]) == {"actor", "critics.SP", f"critics.XP_{other}"}
+    counted = {(one.owner, str(one.kind)): one.steps for one in record.add(0, rollout, judge_partners=True)}
+    assert counted == {(1, "SP"): 80, (2, "SP"): 80, (3, "XP"): 80, (4, "XP"): 80}
+    assert set(made.actors()) == {1, 2, 3, 4} and set(made.figures()[1]) >= {"xp_reward", "sp_reward", "entropy"}
