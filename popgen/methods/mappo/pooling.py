@@ -211,8 +211,7 @@ def pool(
     """One member's batch; None where it played no self-play (a runner was lost). Each critic takes its returns into its
     statistics. `utility` pays in the reward's place, `bonus` (T, N) on top.
     """
-    own, parts, rows = None, [], {}
-    sums: dict[str, list[float]] = {}  # with several partners of a kind, figures are means over them
+    own, parts, rows, told = None, [], {}, []
     for kind, partner, weight in plan.sources(member):
         played, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
         if played is None or not bool(played.trained.any()):
@@ -228,8 +227,7 @@ def pool(
         if kind is Kind.XP and own is not None:
             chosen = bound_advantage(chosen, clip=plan.xp_clip, spread=own)
         spread = chosen.std(correction=0).clamp(min=1e-6)
-        if kind is Kind.SP:
-            own = spread
+        own = spread if kind is Kind.SP else own
         if own is None:
             return None
         scale = torch.maximum(own, spread)
@@ -242,12 +240,20 @@ def pool(
             f"{label}_advantage_std": float(chosen.std(correction=0)),
             f"{label}_explained": _explained_share(chosen, returns[counted]),
         }
-        for figure, value in figures.items():
-            sums.setdefault(figure, []).append(value)
+        told.append(figures)
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return PooledBatch(**joined, critics=rows, figures={name: sum(all_) / len(all_) for name, all_ in sums.items()})
+    return PooledBatch(**joined, critics=rows, figures=_average_figures(told))
+
+
+def _average_figures(told: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """With several partners of a kind, means over them."""
+    found: dict[str, list[float]] = {}
+    for figures in told:
+        for name, value in figures.items():
+            found.setdefault(name, []).append(value)
+    return {name: sum(values) / len(values) for name, values in found.items()}
 
 
 def _change_reward(
