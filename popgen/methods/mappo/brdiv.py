@@ -18,8 +18,7 @@ from popgen.methods.mappo.needs import list_pair_roles
 from popgen.methods.mappo.objective import Objective
 from popgen.methods.mappo.train import STEP_SECONDS, RllibTraining, refuse_inline
 from popgen.methods.mappo.training_job import Job
-from popgen.methods.training import PlannedPhase, TrainedMember
-from popgen.methods.transport import Transport
+from popgen.methods.training import PlannedPhase, TrainedMember, Transport
 from popgen.types import CONFEDERATE_ROLE
 
 

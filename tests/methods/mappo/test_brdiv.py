@@ -19,7 +19,7 @@ from popgen.methods.mappo.needs import check_brdiv, estimate_brdiv
 from popgen.methods.mappo.play_record import PlayRecord
 from popgen.methods.mappo.pooling import Plan, PooledBatch, pool
 from popgen.methods.mappo.training_job import Job
-from popgen.play.matches import Match
+from popgen.play.rollout import Match
 from popgen.types import Kind
 
 SPEC = make_env("overcooked/cramped_room", 1).spec
