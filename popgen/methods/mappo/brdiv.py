@@ -92,6 +92,6 @@ class BrdivTraining(RllibTraining):
 
 
 def open_training(config: BrdivRun, spec: EnvSpec, attempt: str, transport: Transport) -> BrdivTraining:
-    """See `popgen.methods.transport.OpenTraining`."""
+    """See `popgen.methods.training.OpenTraining`."""
     refuse_inline(transport)
     return BrdivTraining(config, spec, attempt)
