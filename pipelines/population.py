@@ -217,6 +217,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         config.run.seed,
         progress=lambda done, total: reporter.update(done / total, episodes=done),
     )
+    reporter.phase("report", 0)
     files = write_report(result, recorder.dir / "report")
     size = len(recorder.population)
     episodes = result.count_episodes()

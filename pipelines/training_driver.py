@@ -2,19 +2,15 @@
 
 The loop says what happened; here it is written down: steps to the ledger, figures to the metrics, segments to the
 checkpoint's log, progress to the screen, checkpoints where they are due.
-
-The time that the whole run still takes is estimated from expected costs of its phases, corrected by what they took.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from popgen.config.run_config import RunConfig
+from popgen.envs.contract import EnvSpec
 from popgen.methods.training import (
     Checkpoint,
     Phase,
@@ -26,94 +22,23 @@ from popgen.methods.training import (
     TrainedMember,
     Training,
 )
+from popgen.pipelines.run_estimate import RunEstimate
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.runs.checkpoints import CheckpointFiles, fitting, member_folder
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import wait_for_room
 
-LEAST_SECONDS, LEAST_SHARE = 2.0, 0.01
-"""The running phase is judged by its own speed once so much time and so much of its total has passed."""
+EVALUATION, REPORT_SECONDS, EVALUATED_SECONDS = "evaluation", 8.0, 4e-5
+"""Its name, and what takes how long on a laptop's core: figures and pages, and each environment step."""
 
 
-@dataclass
-class Spent:
-    """Seconds that work took, for which cost of the plan."""
-
-    seconds: float = 0.0
-    cost: float = 0.0
-
-    def add(self, seconds: float, cost: float) -> None:
-        """More of it."""
-        self.seconds += seconds
-        self.cost += cost
-
-    @property
-    def rate(self) -> float | None:
-        """Seconds for a cost of 1."""
-        return self.seconds / self.cost if self.cost > 0.0 else None
-
-
-class RunEstimate:
-    """What is left of a run's plan.
-
-    Args:
-        plan: the phases in order.
-        clock: seconds, monotonic.
-    """
-
-    def __init__(self, plan: Sequence[PlannedPhase], clock: Callable[[], float] = time.monotonic) -> None:
-        self.plan, self.clock = list(plan), clock
-        self._ended: dict[str, Spent] = {}  # by name, whole phases: cost of what an early end left out included
-        self._work = Spent()
-        self._running: PlannedPhase | None = None
-        self._total, self._first, self._share, self._began = 1.0, 0.0, 0.0, 0.0
-
-    def begin(self, phase: Phase) -> None:
-        """A phase begins: those before it are over. One that the plan does not know takes no time in it."""
-        self._end_running()
-        places = [i for i, one in enumerate(self.plan) if (one.name, one.member) == (phase.name, phase.member)]
-        if places:
-            self._running, self.plan = self.plan[places[0]], self.plan[places[0] + 1 :]
-            self._total, self._began = phase.total or 1.0, self.clock()
-            self._first = self._share = min(1.0, phase.done / self._total)
-
-    def update(self, done: float) -> None:
-        """So much of the running phase's total is done."""
-        self._share = min(1.0, done / self._total)
-
-    def seconds_left(self) -> float | None:
-        """Of the whole run, None as long as nothing was measured."""
-        now, work = self._measure_running(), Spent(self._work.seconds, self._work.cost)
-        work.add(now.seconds, now.cost)
-        if work.rate is None:
-            return None
-        left = 0.0
-        if (running := self._running) is not None:
-            end = (max(self._share, running.earliest) + 1.0) / 2.0  # in the middle of where it still may end
-            left += running.cost * (end - self._share) * (now.rate or work.rate)
-        for phase in self.plan:
-            ended = self._ended.get(phase.name, Spent()).rate
-            left += phase.cost * (work.rate * (phase.earliest + 1.0) / 2.0 if ended is None else ended)
-        return left
-
-    def _measure_running(self) -> Spent:
-        """What the running phase took so far; nothing as long as that says little."""
-        seconds, share = self.clock() - self._began, self._share - self._first
-        if self._running is None or seconds < LEAST_SECONDS or share < LEAST_SHARE:
-            return Spent()
-        return Spent(seconds, share * self._running.cost)
-
-    def _end_running(self) -> None:
-        running, self._running = self._running, None
-        if running is not None and self._share > self._first:
-            seconds = self.clock() - self._began
-            self._work.add(seconds, running.cost * (self._share - self._first))
-            self._ended.setdefault(running.name, Spent()).add(seconds, running.cost * (1.0 - self._first))
-
-
-EVALUATION, EVALUATION_SECONDS, EVALUATED_SECONDS = "evaluation", 3.0, 4e-5
-"""Its name, and what it takes on a laptop's core: in any case, and for each environment step."""
+def plan_evaluation(config: RunConfig, spec: EnvSpec) -> PlannedPhase:
+    """Cross-play of all pairs, each member beside two simple partners, mixed play, and the report."""
+    size, episodes = config.population.size, config.evaluation.episodes
+    mixed = size + 4 * size * (size - 1) if size > 1 else 0
+    played = episodes * (size**2 + 4 * size) + (episodes + 1) // 2 * mixed
+    return PlannedPhase(EVALUATION, size, REPORT_SECONDS + played * spec.horizon * EVALUATED_SECONDS)
 
 
 def title_of_phase(phase: Phase, size: int) -> str:
@@ -140,11 +65,7 @@ class TrainingDriver:
         self.config, self.recorder, self.reporter = config, recorder, reporter
         self.training, self.checkpoints = training, checkpoints
         self.running: tuple[int, ...] = ()
-        size = config.population.size
-        steps = size**2 * config.evaluation.episodes * recorder.spec.horizon
-        self.estimate = RunEstimate(
-            [*training.plan(), PlannedPhase(EVALUATION, size, EVALUATION_SECONDS + steps * EVALUATED_SECONDS)]
-        )
+        self.estimate = RunEstimate([*training.plan(), plan_evaluation(config, recorder.spec)])
 
     def train_members(self) -> None:
         """All members that are missing.
@@ -195,7 +116,8 @@ class TrainingDriver:
         if record.note:
             self.reporter.note(record.note)
         if record.done is not None:
-            self.estimate.update(record.done)
+            work = record.work if isinstance(record, Round) else {}
+            self.estimate.update(record.done, ends_at=record.ends_at, work=work)
             self.reporter.expect(self.estimate.seconds_left())
             self.reporter.update(record.done, **record.shown)
         return isinstance(record, Round) and self._save_if_due(record)
@@ -226,7 +148,7 @@ class TrainingDriver:
         due = record.must_save or self.checkpoints.due()
         if not due or not record.at_rest:
             return due
-        state = {**self.training.checkpoint(), "ledger": len(self.recorder.ledger)}
+        state = {**self.training.checkpoint(), **self._own_state()}
         buffers = self.training.buffers() if self.checkpoints.log_is_long else None
         self.checkpoints.save(self.running[0], state, buffers)
         self.recorder.record_checkpoint(record.member, record.number)
@@ -237,10 +159,13 @@ class TrainingDriver:
         recorder = self.recorder
         if trained.member <= len(recorder.population):
             return
-        self.checkpoints.save_member(trained.member, {**trained.left, "ledger": len(recorder.ledger)})
+        self.checkpoints.save_member(trained.member, {**trained.left, **self._own_state()})
         recorder.add_member(trained.policy, trained.training, seed=trained.seed, extra=trained.extra)
         if trained.note:
             self.reporter.note(trained.note)
+
+    def _own_state(self) -> State:
+        return {"ledger": len(self.recorder.ledger), "estimate": self.estimate.to_state()}
 
     # ---- resuming --------------------------------------------------------------------------------------------------
 
@@ -262,6 +187,10 @@ class TrainingDriver:
                 self.reporter.note(note)
         left = self.checkpoints.load_member(root, finished) if finished else {}
         self._rewind_ledger(checkpoint, left if root == self.recorder.dir else {})
+        state = left if checkpoint is None else checkpoint.state
+        if "estimate" in state:  # one of an earlier version has none
+            with fitting(self.checkpoints.folder):
+                self.estimate.load_state(state["estimate"])
         if not finished:
             return 1, None, checkpoint
         self._adopt_members(root, finished, present, left)

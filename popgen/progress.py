@@ -132,9 +132,9 @@ class PlainReporter:
         self._closed.set()
 
     def _print_phase(self) -> None:
-        if self._expected is None:
+        left = None if self._expected is None else self._expected - self.clock()
+        if left is None or left <= 0.0:  # what took longer than expected promises nothing
             return self._print_line("  ".join(self._phase.describe()))
-        left = self._expected - self.clock()
         self._print_line("  ".join([*self._phase.describe(left), f"about {whole_text(left)} in all"]))
 
     def _print_line(self, text: str) -> None:
@@ -198,12 +198,14 @@ class PhaseColumn(TimeRemainingColumn):
 
 
 class WholeColumn(ProgressColumn):
-    """The time that the whole work still takes, which counts down between two estimates."""
+    """The time that the whole work still takes, which counts down between two estimates, and is not told once it has
+    run out: work that takes longer than expected promises nothing."""
 
     def render(self, task: Task) -> Text:
         """Of a task whose field `expected` is the time of the end."""
         expected = task.fields.get("expected")
-        return Text("" if expected is None else f"all {whole_text(expected - task.get_time())}")
+        left = None if expected is None else expected - task.get_time()
+        return Text("" if left is None or left <= 0.0 else f"all {whole_text(left)}")
 
 
 class RichReporter:

@@ -126,6 +126,18 @@ def test_plain_lines_tell_of_the_whole_run_as_far_as_it_is_known() -> None:
     ]
 
 
+def test_an_estimate_that_has_run_out_is_not_told() -> None:
+    stream, clock = io.StringIO(), Clock()
+    reporter = PlainReporter(stream, every=5.0, clock=clock)
+    reporter.phase("work", 0)
+    reporter.expect(60.0)
+    for now in (10.0, 55.0, 61.0):
+        clock.now = now
+        reporter.update(1.0)
+    told = ["about" in line for line in stream.getvalue().splitlines()]
+    assert told == [True, True, False], stream.getvalue()
+
+
 def test_a_phase_never_takes_longer_than_the_whole() -> None:
     """10 % in 40 s leaves the phase 5:20 to its full length; the whole work, which may end it early, 2 min."""
     clock, stream = Clock(), io.StringIO()

@@ -24,6 +24,7 @@ from popgen.cli.parser import parse
 from popgen.cli.printing import ERROR, INTERRUPTED, OK, short
 from popgen.cli.standard_streams import drop_results, mend_streams, stdout_is_read
 from popgen.errors import UserError
+from popgen.runs.interruption import follows_sigterm
 
 _ROOM = "make room or choose another folder; finished parts are kept"
 _DISK = {
@@ -49,8 +50,9 @@ def _run_command(argv: Sequence[str] | None) -> int:
         sys.stdout.flush()
         return code
     except SystemExit as stop:  # --help and --version, and SIGTERM
-        if stop.code == signal.SIGTERM:
+        if follows_sigterm(stop):
             print("popgen: interrupted by SIGTERM", file=sys.stderr)
+            return int(signal.SIGTERM)
         return int(stop.code or 0)
     except UserError as error:
         return _fail(str(error))

@@ -29,6 +29,8 @@ OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take an
 
 
 QUOTES = "'\""
+CUSTOM_LAYOUT = "env=overcooked/custom"
+SEVERAL_RUNS = "popgen sweep makes several runs"
 
 CHOICES = ("method", "scale", "env")
 """Groups that decide which schema and which recipe the other settings stand on."""
@@ -107,7 +109,7 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     from popgen.methods.registry import DEFAULT_RECIPE, METHODS
 
     folder = None if config_dir is None else _preset_folder(config_dir)
-    translated = [_translate(override) for override in overrides]
+    translated = choose_custom_layout([_translate(override) for override in overrides])
     chosen = _choose_groups(translated, overrides, folder)
     schema = schema_of(chosen)
     recipes = METHODS[chosen["method"]].recipes
@@ -119,6 +121,16 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     keys = [override.lstrip("+").partition("=")[0] for override in translated]
     layout = chosen["env"]["name"]
     return Composed(values, recipe.list_settings(layout), _list_presets(translated, folder), tuple(keys), schema)
+
+
+def choose_custom_layout(words: Sequence[str]) -> list[str]:
+    """Overrides in which a layout's file that stands alone is one of `env=overcooked/custom`: what the default layout
+    sets, such as its cooking, is not asked of the file."""
+    from popgen.config.run_config import LAYOUT_FILE
+
+    given = {key.lstrip("+"): value.strip(QUOTES) for key, _, value in (word.partition("=") for word in words)}
+    is_alone = "env" not in given and given.get("env.name", "").endswith(LAYOUT_FILE)
+    return [CUSTOM_LAYOUT, *words] if is_alone else list(words)
 
 
 def parse_axis(override: str) -> SweepAxis | None:
@@ -413,10 +425,10 @@ def _composition_error(
             "overrides", f"cannot read {_culprit(text, overrides)!r}", "write KEY=VALUE, with quotes around odd text"
         )
     if (sweep := re.search(r"([\w.]+)=\w+\(.*--multirun|Sweep parameters '([\w.]+)", text)) is not None:
-        fix = "give one; several runs need several commands"
+        fix = f"give one; {SEVERAL_RUNS}"
         return UserError(sweep[1] or sweep[2], "asks for several values", fix)
     if text.startswith("Ambiguous value"):
-        fix = "write a list as KEY=[a,b]; several runs need several commands"
+        fix = f"write a list as KEY=[a,b]; {SEVERAL_RUNS}"
         return UserError(
             "overrides", f"{text.partition(chr(10))[0].rpartition(' ')[2].strip(chr(39))!r} has several values", fix
         )

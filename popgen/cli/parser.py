@@ -22,8 +22,12 @@ from popgen.cli import run_command as run
 from popgen.cli import study_commands as study
 from popgen.cli import sweep_command as sweep
 from popgen.cli.arguments import Parser, expand_home, list_words, suggest_word
+from popgen.cli.compose import SEVERAL_RUNS
 from popgen.cli.printing import ERROR
 from popgen.errors import UserError
+
+HYDRAS_MANY = ("--multirun", "-m")
+"""What other programs on Hydra take for several runs."""
 
 
 def parse(argv: list[str]) -> argparse.Namespace:
@@ -42,6 +46,7 @@ def parse(argv: list[str]) -> argparse.Namespace:
         command, options = list_words(parser, argv)
         meant = suggest_word(rest[0].partition("=")[0], options)
         fix = f"did you mean {meant}?" if meant else f"see {command} --help"
+        fix = SEVERAL_RUNS if rest[0] in HYDRAS_MANY else fix
         raise UserError("arguments", f"unknown argument {rest[0]}", fix)
     if args.command is None:
         parser.print_help(sys.stderr)

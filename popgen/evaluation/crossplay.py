@@ -12,7 +12,7 @@ import pandas as pd
 
 from popgen.errors import UserError
 from popgen.evaluation.estimates import Estimate, adjust_by_holm
-from popgen.evaluation.mixed_play import MixedPlay, play_mixed
+from popgen.evaluation.mixed_play import MixedPlay, count_mixed_episodes, play_mixed
 from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
 from popgen.play.rollout import play_teams
@@ -207,16 +207,16 @@ def evaluate_population(
     chosen = _choose_members(population, members)
     if episodes < 1:
         raise UserError("evaluation.episodes", f"must be at least 1, got {episodes}")
-    spec = population.spec
-    labels, count = [*map(str, chosen), *PARTNERS], len(chosen)
+    spec, labels, count = population.spec, [*map(str, chosen), *PARTNERS], len(chosen)
     policies: list[Policy] = [population[member] for member in chosen]
     policies += [RandomPolicy(spec.num_actions), IdlePolicy(spec.action_names)]
     # All pairs but those of the two partners among themselves.
     matches = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
-    played = play_teams(
-        population.make_env, policies, matches, episodes, seed=seed, max_envs=max_envs, progress=progress
-    )
-    mixed = play_mixed(population.make_env, dict(zip(chosen, policies, strict=False)), -(-episodes // 2), seed)
+    own, halves, first = dict(zip(chosen, policies, strict=False)), -(-episodes // 2), len(matches) * episodes
+    tell = _tell_of_all(progress, first + count_mixed_episodes(list(own.values()), halves))
+    make = population.make_env
+    played = play_teams(make, policies, matches, episodes, seed=seed, max_envs=max_envs, progress=tell)
+    mixed = play_mixed(make, own, halves, seed, progress=lambda done: tell(first + done))
     seats = [(labels[i], labels[j]) for i, j in matches]
     rows = [slice(n * episodes, (n + 1) * episodes) for n in range(len(matches))]
     return CrossPlayResult(
@@ -233,6 +233,11 @@ def evaluate_population(
         mixed=mixed.plays,
         mixed_episodes=mixed.episodes,
     )
+
+
+def _tell_of_all(progress: Callable[[int, int], None] | None, total: int) -> Callable[..., None]:
+    """What is told (episodes done, episodes of a part), as one of (episodes done, `total`)."""
+    return lambda done, _=0: progress(done, total) if progress is not None else None
 
 
 def _choose_members(population: Population, members: Sequence[int] | None) -> tuple[int, ...]:

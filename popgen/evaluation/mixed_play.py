@@ -12,7 +12,7 @@ CoMeDi (Sarkar et al. 2023) trains with such episodes; here they judge every met
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,7 +115,12 @@ def play_switches(env: BatchedEnv, policies: list[Policy], switches: list[Switch
 
 
 def play_mixed(
-    make: Callable[[int, int], BatchedEnv], members: Mapping[int, Policy], episodes: int, seed: int
+    make: Callable[[int, int], BatchedEnv],
+    members: Mapping[int, Policy],
+    episodes: int,
+    seed: int,
+    *,
+    progress: Callable[[int], None] | None = None,
 ) -> MixedPlays:
     """Mixed play of every member after cross-play with every other one, in both seats.
 
@@ -126,6 +131,7 @@ def play_mixed(
         members: number -> policy.
         episodes: N, of each member, partner, seat and way of going on, and of ordinary self-play.
         seed: same arguments, same result.
+        progress: called with the episodes done, of `count_mixed_episodes`, after each batch.
     """
     numbers, policies = list(members), list(members.values())
     if len(numbers) < 2:
@@ -137,8 +143,11 @@ def play_mixed(
     rows = [Switch(*case, int(step), forget) for case, forget in programme for step in steps]
     parts = [rows[start : start + MAX_ENVS] for start in range(0, len(rows), MAX_ENVS)]
     seeds = np.random.SeedSequence([seed, 1]).generate_state(len(parts))
-    pairs = zip(parts, seeds, strict=True)
-    scores = [play_switches(make(len(part), 0), policies, part, int(own >> 1)) for part, own in pairs]
+    scores: list[SwitchedScores] = []
+    for part, own in zip(parts, seeds, strict=True):
+        scores.append(play_switches(make(len(part), 0), policies, part, int(own >> 1)))
+        if progress is not None:
+            progress(sum(len(done.scores) for done in scores))
     table = np.concatenate([part.scores for part in scores]).reshape(len(programme), episodes)
     found = {key: Estimate.of(row) for key, row in zip(programme, table, strict=True)}
     plays = [
@@ -149,10 +158,15 @@ def play_mixed(
     return MixedPlays(tuple(plays), sum(part.steps for part in scores), len(rows))
 
 
+def count_mixed_episodes(policies: Sequence[Policy], episodes: int) -> int:
+    """Episodes that `play_mixed` takes."""
+    return len(_list_cases(policies)) * episodes if len(policies) > 1 else 0
+
+
 _Case = tuple[tuple[tuple[int, int], tuple[int, int]], bool]
 
 
-def _list_cases(policies: list[Policy]) -> list[_Case]:
+def _list_cases(policies: Sequence[Policy]) -> list[_Case]:
     """((before, after), forget): self-play of each, then cross-play that each of the two takes over."""
     everybody = range(len(policies))
     cases: list[_Case] = [(((m, m), (m, m)), False) for m in everybody]

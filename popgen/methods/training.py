@@ -159,15 +159,18 @@ class PlannedPhase:
 
     Attributes:
         name, member, last: as those of `Phase`.
-        cost: seconds that its total takes on two laptop cores, roughly: what counts is the ratio of phases.
+        cost: seconds that its total takes on two laptop cores, roughly: what counts is the ratio of phases. By kind of
+            work where it has several, or one that other phases have too (the kinds of `Round.work`).
         earliest: share of the total at which it may be over, where a target can end it.
+        side_by_side: its kinds of work go on at the same time, so that the longest one counts.
     """
 
     name: str
     member: int
-    cost: float
+    cost: float | Mapping[str, float]
     last: int = 0
     earliest: float = 1.0
+    side_by_side: bool = False
 
 
 @dataclass(frozen=True)
@@ -181,6 +184,7 @@ class Progress:
         sampled: real steps, for the ledger and the checkpoint's log.
         counted: other steps, for the ledger.
         done: of the phase's total.
+        ends_at: of the phase's total, where the phase will end as things stand; None where that is open.
         shown: figures of the progress line.
         note: a line for the user.
     """
@@ -191,6 +195,7 @@ class Progress:
     sampled: tuple[Sampled, ...] = ()
     counted: tuple[StepCount, ...] = ()
     done: float | None = None
+    ends_at: float | None = None
     shown: Mapping[str, float | int | str] = field(default_factory=dict)
     note: str = ""
 

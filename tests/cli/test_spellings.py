@@ -74,7 +74,20 @@ def test_options_and_paths_of_every_command(home: str, run: Run, random_populati
 def test_several_values_are_told_as_such(word: str, run: Run) -> None:
     code, out, err = run("run", "--dry-run", word)
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "several values" in err and "several runs need" in err and "multirun" not in err
+    assert "several values" in err and "popgen sweep makes several runs" in err and "multirun" not in err
+
+
+@pytest.mark.parametrize(("words", "cooking"), [(["env=overcooked/cramped_room"], "auto"), ([], None)])
+def test_a_layouts_file_alone_is_not_asked_for_the_default_layouts_cooking(words: list[str], cooking: str) -> None:
+    name = "env.name='overcooked/./mine.layout'"
+    assert compose([*words, name])["env"]["params"]["cooking"] == cooking
+    assert compose([*words, name, "env.params.cooking=interact"])["env"]["params"]["cooking"] == "interact"
+
+
+@pytest.mark.parametrize("flag", ["--multirun", "-m"])
+def test_hydras_way_to_several_runs_names_ours(flag: str, run: Run) -> None:
+    code, _, err = run("run", flag, "seed=1,2")
+    assert code == 2 and "popgen sweep makes several runs" in err
 
 
 # --- a run is known by what its paths mean

@@ -161,3 +161,19 @@ def test_every_integer_type_is_an_action(action):
     env = parallel_env("overcooked/cramped_room")
     env.reset(seed=0)
     assert env.step({"player_0": action, "player_1": 4})[1]
+
+
+@pytest.mark.parametrize(("dtype", "kept"), [("float32", "float32"), ("float64", "float64"), (None, "uint8")])
+def test_observations_come_in_the_type_that_a_network_takes(dtype, kept):
+    """RLlib's default network takes no bytes; the values are the same."""
+    env, plain = parallel_env("overcooked/cramped_room", dtype=dtype), parallel_env("overcooked/cramped_room")
+    (seen, _), (bytes_, _) = env.reset(seed=3), plain.reset(seed=3)
+    for agent in env.possible_agents:
+        assert seen[agent].dtype == env.observation_space(agent).dtype == np.dtype(kept)
+        assert env.observation_space(agent).contains(seen[agent])
+        assert (seen[agent] == bytes_[agent]).all()
+
+
+def test_a_type_that_cannot_hold_the_values_is_refused():
+    with pytest.raises(UserError, match="dtype"):
+        parallel_env("rendezvous/mppmr", dtype="uint8")

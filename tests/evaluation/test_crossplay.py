@@ -65,6 +65,15 @@ def test_rows_are_seat_0_and_columns_seat_1() -> None:
     assert got.steps == (12 * 4 + got.mixed_episodes) * HORIZON and got.mixed_episodes == (2 + 4) * 2
 
 
+@pytest.mark.parametrize("members", [1, 2, 3])
+def test_progress_counts_every_episode_of_mixed_play_too(members: int) -> None:
+    told: list[tuple[int, int]] = []
+    cast = Cast(*[Script([ONE]) for _ in range(members)])
+    got = evaluate_population(cast, 3, 0, max_envs=8, progress=lambda *at: told.append(at))  # type: ignore[arg-type]
+    assert told == sorted(set(told)) and {total for _, total in told} == {got.count_episodes()}
+    assert told[-1][0] == got.count_episodes()
+
+
 def test_the_frame_names_its_seats_and_can_hold_the_partners() -> None:
     got = evaluate_population(Cast(Script([ONE]), Script([TWO, STAY])), 4, 0)  # type: ignore[arg-type]
     frame = got.to_frame(labels=(2, "idle"))

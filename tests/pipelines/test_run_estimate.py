@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import pytest
 
@@ -15,10 +18,12 @@ from popgen.methods.mappo.config import BaselineRun
 from popgen.methods.mappo.lipo import OBJECTIVE as LIPO
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.train import RllibTraining
-from popgen.methods.training import Phase, PlannedPhase
+from popgen.methods.training import Phase, PlannedPhase, State, Work
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import plan_phases
-from popgen.pipelines.training_driver import RunEstimate
+from popgen.pipelines import run_estimate
+from popgen.pipelines.run_estimate import RunEstimate, costs_of
+from popgen.pipelines.training_driver import plan_evaluation
 
 
 class Clock:
@@ -42,7 +47,7 @@ class Stretch:
     begin: float = 0.0
 
 
-# As `scale=demo` in the cramped room went, by its run.log: the first member reached its target after 160,000
+# `scale=demo` in the cramped room on two cores, by its run.log: the first member reached its target after 160,000
 # of 344,000 steps of self-play, the second played four of five rounds at most.
 DEMO = (
     Stretch("random play", 1, 1.3),
@@ -51,13 +56,79 @@ DEMO = (
     Stretch("imagination", 2, 240.6, end=280 / 340),
     Stretch("evaluation", 2, 20.0),
 )
-EVALUATION = PlannedPhase("evaluation", 2, 4.0)
 
 
-def demo_plan() -> list[PlannedPhase]:
-    config = RunConfig.parse(compose(["env=overcooked/cramped_room", "scale=demo"]))
+@cache
+def demo_plan(transport: str = "ray") -> list[PlannedPhase]:
+    config = RunConfig.parse(compose(["env=overcooked/cramped_room", "scale=demo", f"run.transport={transport}"]))
     assert isinstance(config, XpmWmRun)
-    return [*plan_phases(config, make_env(config.env.name, 1).spec), EVALUATION]
+    spec = make_env(config.env.name, 1).spec
+    return [*plan_phases(config, spec), plan_evaluation(config, spec)]
+
+
+# The same in one process (run.transport=inline), in processor seconds, as the driver's records told it: seconds since
+# the first phase, what is done of the phase, and seconds of the model's and of the agent's updates where a round ended.
+RECORDED: list[tuple[float, Phase | float, dict[str, Work]]] = [
+    (0.0, Phase("random play", 256_000, 1), {}),
+    (3.5, 102_400, {}),
+    (3.8, Phase("world model", 1500, 1), {}),
+    (32.2, 400, {}),
+    (62.7, 800, {}),
+    (90.6, 1200, {}),
+    (112.2, Phase("self-play", 344_000, 1), {}),
+    (128.2, 25_600, {"model": Work(4, 6.7), "agent": Work(4, 7.7)}),
+    (144.7, 51_200, {"model": Work(8, 13.9), "agent": Work(8, 15.2)}),
+    (162.6, 76_800, {"model": Work(12, 21.4), "agent": Work(12, 23.7)}),
+    (179.7, 102_400, {"model": Work(16, 28.7), "agent": Work(16, 31.6)}),
+    (186.2, Phase("imagination", 340, 2), {}),
+    (217.2, 50, {}),
+    (250.7, 100, {}),
+    (303.2, 150, {}),
+    (309.3, 160, {}),
+    (361.7, 210, {}),
+    (368.1, 220, {}),
+]
+RECORDED_END = 445.3
+
+
+def make_clocked(plan: Sequence[PlannedPhase]) -> tuple[RunEstimate, Clock]:
+    clock = Clock()
+    return RunEstimate(plan, clock), clock
+
+
+def replay(estimate: RunEstimate, clock: Clock, begin: float, end: float) -> list[tuple[float, float]]:
+    """(seconds, estimate over truth) at each record from `begin` to `end`."""
+    ratios, start = list[tuple[float, float]](), clock.now
+    for seconds, done, work in RECORDED:
+        if not begin <= seconds <= end:
+            continue
+        clock.now = start + seconds - begin
+        if isinstance(done, Phase):
+            estimate.begin(done)
+            continue
+        estimate.update(done, work=work)
+        if (left := estimate.seconds_left()) is not None:
+            ratios.append((seconds, left / (RECORDED_END - seconds)))
+    return ratios
+
+
+def test_a_recorded_demo_is_foreseen_within_a_factor_of_one_and_a_half() -> None:
+    """From its first seconds to its last round, which decides whether a further one follows."""
+    estimate, clock = make_clocked(demo_plan("inline"))
+    ratios = replay(estimate, clock, 0.0, RECORDED_END)
+    assert len(ratios) == 14
+    assert all(1 / 1.5 <= ratio <= 1.5 for _, ratio in ratios), ratios
+
+
+def test_a_recorded_demo_that_goes_on_knows_its_speed() -> None:
+    """It was killed after two rounds of its second member."""
+    before, clock = make_clocked(demo_plan("inline"))
+    replay(before, clock, 0.0, 309.3)
+    after, clock = make_clocked(demo_plan("inline"))
+    after.load_state(json.loads(json.dumps(before.to_state())))
+    after.begin(Phase("imagination", 340, 2, done=160))
+    ratios = replay(after, clock, 309.4, RECORDED_END)
+    assert len(ratios) == 2 and all(1 / 1.5 <= ratio <= 1.5 for _, ratio in ratios), ratios
 
 
 def estimate_after(plan: Sequence[PlannedPhase], run: Sequence[Stretch], share: float) -> tuple[float, float]:
@@ -79,7 +150,7 @@ def estimate_after(plan: Sequence[PlannedPhase], run: Sequence[Stretch], share: 
     return seconds, total * (1.0 - share)
 
 
-@pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
 def test_the_demo_is_foreseen_within_a_factor_of_one_and_a_half(share: float) -> None:
     estimate, truth = estimate_after(demo_plan(), DEMO, share)
     assert 1 / 1.5 <= estimate / truth <= 1.5
@@ -98,17 +169,104 @@ def test_eight_members_each_as_long_as_the_one_before() -> None:
     plan = [PlannedPhase("play", member, 10.0) for member in range(1, 9)]
     run = [Stretch("play", member, 30.0) for member in range(1, 9)]
     estimate, truth = estimate_after(plan, run, 2.5 / 8)
-    assert truth == 165.0 and estimate == pytest.approx(165.0)
+    assert truth == 165.0 and estimate == pytest.approx(165.0, rel=0.02)
 
 
-def test_an_early_end_is_expected_again() -> None:
-    """A member that ended at 40 % of its budget in 20 s: the next is to take 20 s too, not 50."""
-    plan = [PlannedPhase("play", member, 50.0, earliest=0.0) for member in (1, 2)]
-    estimate, _ = estimate_after(plan, [Stretch("play", 1, 20.0, end=0.4)], 1.0)
-    assert estimate == pytest.approx(30.0 / 2 + 25.0), "it may still go on: to the middle; the next one to its middle"
-    run = [Stretch("play", 1, 20.0, end=0.4), Stretch("play", 2, 20.0, end=0.4)]
-    estimate, _ = estimate_after(plan, run, 0.5 + 1e-9)
-    assert estimate == pytest.approx(0.5 * 50.0, rel=0.3)
+def test_early_ends_are_expected_again() -> None:
+    """Members that ended at 40 % of their budget of 50 s: the next is to end between there and the middle."""
+    plan = [PlannedPhase("play", member, 50.0, earliest=0.0) for member in range(1, 5)]
+    run = [Stretch("play", member, 20.0, end=0.4) for member in range(1, 5)]
+    estimate, truth = estimate_after(plan, run[:1], 1.0)
+    assert estimate == pytest.approx(15.0 + 3 * 25.0), "nothing has ended: to the middle of what is left, and of each"
+    estimate, truth = estimate_after(plan, run, 0.75)
+    assert truth == 20.0 and estimate == pytest.approx(15.0 + 50.0 * (0.5 + 0.4 + 0.4) / 3), "the fourth is expected"
+
+
+def spend(estimate: RunEstimate, clock: Clock, seconds: float, done: float, **more: Any) -> float:
+    """Seconds left after more work; sure of the rates, so that what is measured counts alone."""
+    clock.now += seconds
+    estimate.update(done, **more)
+    left = estimate.seconds_left()
+    assert left is not None
+    return left
+
+
+@pytest.fixture
+def certain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measurements count alone."""
+    for name in ("PRIOR_SECONDS", "KIND_SECONDS", "PHASE_SECONDS"):
+        monkeypatch.setattr(run_estimate, name, 1e-9)
+
+
+@pytest.mark.usefixtures("certain")
+def test_kinds_of_work_are_timed_where_they_first_occur() -> None:
+    """Phase "both" gives seconds by kind: the model's work takes 3 s for a cost of 1, the agent's 1; what follows is of
+    the agent alone, then of both in turn."""
+    later = [PlannedPhase("agent alone", 2, {"agent": 40.0}), PlannedPhase("turns", 3, {"agent": 10.0, "model": 10.0})]
+    estimate, clock = make_clocked([PlannedPhase("both", 1, {"agent": 20.0, "model": 20.0}), *later])
+    estimate.begin(Phase("both", 100, 1))
+    left = spend(estimate, clock, 40.0, 50, work={"agent": Work(1, 10.0), "model": Work(1, 30.0)})
+    assert left == pytest.approx(40.0 + 40.0 + 40.0)
+
+
+@pytest.mark.usefixtures("certain")
+def test_side_by_side_the_longest_kind_counts() -> None:
+    """The same work on two cores: 30 s for the first half, as long as the model takes."""
+    both = PlannedPhase("both", 1, {"agent": 20.0, "model": 20.0}, side_by_side=True)
+    estimate, clock = make_clocked([both, PlannedPhase("agent alone", 2, {"agent": 40.0})])
+    estimate.begin(Phase("both", 100, 1))
+    left = spend(estimate, clock, 30.0, 50, work={"agent": Work(1, 10.0), "model": Work(1, 30.0)})
+    assert left == pytest.approx(30.0 + 40.0)
+
+
+@pytest.mark.usefixtures("certain")
+def test_what_kinds_do_not_explain_is_of_the_phase() -> None:
+    """A phase that waits takes 20 s where its work takes 10; so does the next of its name, and no other."""
+    plan = [PlannedPhase("waits", 1, {"agent": 10.0}), PlannedPhase("waits", 2, {"agent": 10.0, "model": 10.0})]
+    estimate, clock = make_clocked([PlannedPhase("model", 1, {"model": 10.0}), *plan])
+    estimate.begin(Phase("model", 100, 1))
+    assert spend(estimate, clock, 10.0, 100) == pytest.approx(30.0)
+    estimate.begin(Phase("waits", 100, 1))
+    assert spend(estimate, clock, 20.0, 100) == pytest.approx(30.0), "20 s of the agent's work, 10 of the model's"
+
+
+@pytest.mark.usefixtures("certain")
+def test_an_end_that_is_known_is_taken() -> None:
+    estimate, clock = make_clocked([PlannedPhase("play", 1, 100.0, earliest=0.6)])
+    estimate.begin(Phase("play", 100, 1))
+    assert spend(estimate, clock, 40.0, 40) == pytest.approx(40.0), "to the middle of where it may end"
+    assert spend(estimate, clock, 10.0, 50, ends_at=60) == pytest.approx(10.0)
+
+
+def test_the_first_seconds_promise_no_hours() -> None:
+    """9 s for what was to take 0.13, while code is compiled: a run of 5 minutes is told as less than 15."""
+    estimate, clock = make_clocked(demo_plan())
+    estimate.begin(Phase("random play", 256_000, 1))
+    assert 200.0 < spend(estimate, clock, 9.0, 25_600) < 900.0
+
+
+def test_another_attempt_goes_on_with_what_was_measured() -> None:
+    """Also through a checkpoint's file: a member that takes 30 s in place of 10, known from the first second on."""
+    plan = [PlannedPhase("play", member, 10.0) for member in range(1, 9)]
+    estimate, clock = make_clocked(plan)
+    for member in (1, 2, 3, 4):
+        estimate.begin(Phase("play", 100, member))
+        spend(estimate, clock, 30.0, 100)
+    again, later = make_clocked(plan)
+    again.load_state(json.loads(json.dumps(estimate.to_state())))
+    again.begin(Phase("play", 100, 5))
+    assert spend(again, later, 3.0, 10) == pytest.approx(3.9 * 30.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "damage", [{"work": 3}, {"kinds": {"a": {}}}, {"phases": {"a": {"seconds": 1}}}, {"ends": [1]}]
+)
+def test_a_damaged_state_does_not_fit(damage: State) -> None:
+    whole = {"work": {"seconds": 1.0, "cost": 1.0}, "kinds": {}, "phases": {}, "ends": {}}
+    estimate, _ = make_clocked([])
+    estimate.load_state(whole)
+    with pytest.raises((LookupError, TypeError, ValueError, AttributeError)):
+        estimate.load_state(whole | damage)
 
 
 def test_nothing_is_promised_before_something_was_measured() -> None:
@@ -136,5 +294,5 @@ def test_baselines_plan_a_phase_for_each_group_of_members(
     assert isinstance(config, BaselineRun)
     plan = RllibTraining(config, make_env(config.env.name, 1).spec, "run.1", objective).plan()
     assert [(phase.member, phase.last) for phase in plan] == groups
-    costs = [phase.cost for phase in plan]
+    costs = [sum(costs_of(phase).values()) for phase in plan]
     assert min(costs) > 0.0 and costs == sorted(costs), "whoever meets more partners takes longer"

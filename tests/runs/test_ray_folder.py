@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from pathlib import Path
 
 import pytest
 
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.runs import interruption
 from popgen.runs.directory import named
 from popgen.runs.interruption import end_on_sigterm
 from popgen.runs.ray_folder import check_ray_folder, default_folder, holds_sockets, make_ray_folder
@@ -50,7 +52,8 @@ def test_what_cannot_work_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
         check_ray_folder()
 
 
-def test_sigterm_ends_in_an_orderly_way_and_only_once() -> None:
+def test_sigterm_ends_in_an_orderly_way_and_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interruption, "_received", threading.Event())
     before = signal.getsignal(signal.SIGTERM)
     try:
         end_on_sigterm()
@@ -61,6 +64,21 @@ def test_sigterm_ends_in_an_orderly_way_and_only_once() -> None:
         os.kill(os.getpid(), signal.SIGTERM)  # while the books are being closed
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def test_an_exit_that_ray_numbers_anew_is_still_by_sigterm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interruption, "_received", threading.Event())
+    before = signal.getsignal(signal.SIGTERM)
+    assert interruption.describe_interruption(SystemExit(1)) is None
+    try:
+        end_on_sigterm()
+        with pytest.raises(SystemExit):
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pause()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert interruption.describe_interruption(SystemExit(1)) == "interrupted by SIGTERM"
+    assert interruption.describe_interruption(RuntimeError("1")) is None
 
 
 def test_runs_of_one_second_have_ids_of_their_own() -> None:

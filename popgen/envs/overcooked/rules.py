@@ -205,7 +205,8 @@ def _read_recipes(orders: Iterable[Any], field: str) -> Iterable[tuple[int, int]
         try:
             names = list(order["ingredients"])
         except (TypeError, KeyError):
-            raise UserError(field, f"order {order!r} has no ingredients", "write {'ingredients': ['onion']}") from None
+            fix = "write a soup of three as {'ingredients': ['onion', 'onion', 'onion']}"
+            raise UserError(field, f"order {order!r} has no ingredients", fix) from None
         soup = (names.count("onion"), names.count("tomato"))
         if sum(soup) != len(names) or soup not in SOUP_CODE:
             raise UserError(field, f"order {names!r} is no recipe", "use one to three of 'onion' and 'tomato'")

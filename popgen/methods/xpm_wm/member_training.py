@@ -18,7 +18,7 @@ from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 
-ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS = 8e-5, 5e-5, 5e-6
+ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS = 8e-5, 6.5e-5, 5e-6
 """On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step."""
 
 
@@ -29,18 +29,20 @@ def plan_phases(config: WorldModelRun, spec: EnvSpec) -> list[PlannedPhase]:
     alone = agent.starts_sp * agent.horizon * IMAGINED_SECONDS
     together = (agent.starts_sp + agent.starts_xp) * agent.horizon * IMAGINED_SECONDS
     rounds = phase1.self_play_steps(one) / (one.envs * one.steps_per_iteration)
-    each = one.model_updates * model_update + one.agent_updates * alone
+    both = {"model": rounds * one.model_updates * model_update, "agent": rounds * one.agent_updates * alone}
+    overlaps = config.run.transport == "ray"
     phases = [
         PlannedPhase(phase1.RANDOM_PLAY, FIRST, one.prefill_steps * STEP_SECONDS),
-        PlannedPhase(phase1.MODEL_ALONE, FIRST, one.pretrain_updates * model_update),
-        PlannedPhase(phase1.SELF_PLAY, FIRST, rounds * each, earliest=0.0),
+        PlannedPhase(phase1.MODEL_ALONE, FIRST, {"model": one.pretrain_updates * model_update}),
+        PlannedPhase(phase1.SELF_PLAY, FIRST, both, earliest=0.0, side_by_side=overlaps),
     ]
     for member in range(FIRST + 1, config.population.size + 1):
         most = phase2.most_rounds(two, phase2.cross_play_episodes(two, member - 1), spec.horizon)
         updates = phase2.count_imagination(two, most)
-        cost = updates * together + (most - 1) * two.model_updates * model_update
+        cost = {"model": (most - 1) * two.model_updates * model_update, "agent": updates * together}
         earliest = phase2.count_imagination(two, min(two.rounds, most)) / updates
-        phases.append(PlannedPhase(phase2.IMAGINATION, member, cost, earliest=earliest))
+        beside = overlaps and two.model_lag > 0
+        phases.append(PlannedPhase(phase2.IMAGINATION, member, cost, earliest=earliest, side_by_side=beside))
     return phases
 
 

@@ -153,10 +153,18 @@ def describe_imagination(progress: LaterMemberProgress, phase: Phase2Config, mem
     return Phase(IMAGINATION, total, member, done=done)
 
 
-def describe_updates(progress: LaterMemberProgress, member: int, figures: dict[str, float], done: int) -> Progress:
-    """So many of the member's updates in imagination are done."""
+def describe_updates(
+    progress: LaterMemberProgress, member: int, figures: dict[str, float], done: int, phase: Phase2Config, most: int
+) -> Progress:
+    """So many of the member's updates in imagination are done, of those of at most so many rounds."""
     shown = {"steps": progress.steps, "entropy": round(figures["agent/entropy"], 2), **progress.best_shown}
-    return Progress(member, progress.steps, figures, done=done, shown=shown)
+    return Progress(member, progress.steps, figures, done=done, shown=shown, ends_at=foresee_end(progress, phase, most))
+
+
+def foresee_end(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> int | None:
+    """Agent updates after which the member is complete if it is good enough by now; None where it is still weak."""
+    is_open = progress.best is None or progress.best.sp < phase.target_score or phase.plateau > 0
+    return None if is_open else count_imagination(phase, max(progress.rounds, min(phase.rounds, most)))
 
 
 def describe_later_round(

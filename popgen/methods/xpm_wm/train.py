@@ -222,10 +222,10 @@ class LaterMember:
         scores, pressed, done = progress.strength.scores(), progress.constraint.multipliers, plan.done  # 9
         task = AgentTask(0, model, starts, plan.new_share, scores, progress.plays, self.tally(), multipliers=pressed)
         while True:
-            count = min(AGENT_PIECE, plan.done + plan.updates - done)
-            update = self.work.update_agent(replace(task, updates=count)).result()  # 11-15
-            self.imagined, done = named_figures("agent", update.metrics) | {"updates": done}, done + count
-            yield phase2.describe_updates(progress, self.member, self.imagined, done)
+            task = replace(task, updates=min(AGENT_PIECE, plan.done + plan.updates - done))
+            update = self.work.update_agent(task).result()  # 11-15
+            self.imagined, done = named_figures("agent", update.metrics) | {"updates": done}, done + task.updates
+            yield phase2.describe_updates(progress, self.member, self.imagined, done, self.phase, self.most_rounds)
             if done == plan.done + plan.updates:
                 return update.weights
 
