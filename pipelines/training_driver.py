@@ -2,11 +2,22 @@
 
 The loop says what happened; here it is written down: steps to the ledger, figures to the metrics, segments to the
 checkpoint's log, progress to the screen, checkpoints where they are due.
+
+The time that the whole run still takes is told from expected costs of its phases, corrected by what they took:
+
+    seconds of a phase = speed of the phase * its cost by kind of work, each times the seconds that a cost of 1 takes
+
+Both factors are measured. Where nothing is, they are those of the recipe (1) or of the work so far, which count as so
+many seconds of measurement; so the first seconds, in which code is compiled and buffers are filled, promise nothing.
 """
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from popgen.config.run_config import RunConfig
@@ -21,13 +32,188 @@ from popgen.methods.training import (
     State,
     TrainedMember,
     Training,
+    Work,
 )
-from popgen.pipelines.run_estimate import RunEstimate
 from popgen.population import load_population
 from popgen.progress import Reporter
 from popgen.runs.checkpoints import CheckpointFiles, fitting, member_folder
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import wait_for_room
+
+PRIOR_SECONDS, KIND_SECONDS, PHASE_SECONDS = 20.0, 5.0, 5.0
+"""What was not measured counts as a measurement of so many seconds: the recipe for all work, all work for a kind of it,
+the kinds of a phase's work for the phase."""
+LEAST_SECONDS = 2.0
+"""A run promises nothing before."""
+
+
+@dataclass
+class Spent:
+    """Seconds that work took, and those that it was to cost."""
+
+    seconds: float = 0.0
+    cost: float = 0.0
+
+    def add(self, seconds: float, cost: float) -> None:
+        """More of it."""
+        self.seconds += seconds
+        self.cost += cost
+
+    def rate(self, prior: float, weight: float) -> float:
+        """Seconds for a cost of 1, `prior` counting as a cost of `weight`."""
+        return (self.seconds + weight * prior) / (self.cost + weight)
+
+
+@dataclass
+class SpentByKind:
+    """Seconds that phases of one name took, and what they were to cost by kind of work."""
+
+    seconds: float = 0.0
+    costs: dict[str, float] = field(default_factory=dict)
+
+    def add(self, seconds: float, costs: Mapping[str, float]) -> None:
+        """More of it."""
+        self.seconds += seconds
+        self.costs = {kind: self.costs.get(kind, 0.0) + cost for kind, cost in costs.items()}
+
+
+@dataclass
+class Measured:
+    """What a run's work has shown.
+
+    Attributes:
+        work: all of it.
+        kinds: work of one kind.
+        phases: phases of one name.
+        ends: shares of the total at which phases of a name were over.
+    """
+
+    work: Spent = field(default_factory=Spent)
+    kinds: dict[str, Spent] = field(default_factory=dict)
+    phases: dict[str, SpentByKind] = field(default_factory=dict)
+    ends: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, phase: PlannedPhase, share: float, seconds: float, work: Mapping[str, Work]) -> None:
+        """So much of a phase took so many seconds; `work` by kind, as far as it is known."""
+        costs = {kind: share * cost for kind, cost in costs_of(phase).items()}
+        known = {kind: work[kind].seconds for kind in costs if kind in work}
+        known |= dict.fromkeys(costs, seconds) if len(costs) == 1 else {}
+        self.work.add(seconds, join_kinds(phase, costs))
+        for kind, spent in known.items():
+            self.kinds.setdefault(kind, Spent()).add(spent, costs[kind])
+        self.phases.setdefault(phase.name, SpentByKind()).add(seconds, costs)
+
+    def predict_phase(self, phase: PlannedPhase) -> float:
+        """Seconds that its total takes."""
+        past = self.phases.get(phase.name, SpentByKind())
+        common = self.work.rate(1.0, PRIOR_SECONDS)
+        costs = costs_of(phase)
+        rates = {kind: self.kinds.get(kind, Spent()).rate(common, KIND_SECONDS) for kind in costs}
+        expected = join_kinds(phase, {kind: past.costs.get(kind, 0.0) * rate for kind, rate in rates.items()})
+        correction = Spent(past.seconds, expected).rate(1.0, PHASE_SECONDS)
+        return correction * join_kinds(phase, {kind: costs[kind] * rate for kind, rate in rates.items()})
+
+    def expect_end(self, phase: PlannedPhase, share: float = 0.0) -> float:
+        """The share of its total at which it will be over, now at `share`: in the middle of where it still may be, and
+        where those before it were."""
+        guesses = [(max(share, phase.earliest) + 1.0) / 2.0]
+        guesses += [end for end in self.ends.get(phase.name, []) if end > share]
+        return sum(guesses) / len(guesses)
+
+
+def costs_of(phase: PlannedPhase) -> dict[str, float]:
+    """Its cost by kind of work; a phase that names no kinds is one of its own."""
+    return {phase.name: phase.cost} if isinstance(phase.cost, (int, float)) else dict(phase.cost)
+
+
+def join_kinds(phase: PlannedPhase, parts: Mapping[str, float]) -> float:
+    """Seconds of all its kinds of work together."""
+    return max(parts.values()) if phase.side_by_side else sum(parts.values())
+
+
+class RunEstimate:
+    """What is left of a run's plan.
+
+    Args:
+        plan: the phases in order.
+        clock: seconds, monotonic.
+    """
+
+    def __init__(self, plan: Sequence[PlannedPhase], clock: Callable[[], float] = time.monotonic) -> None:
+        self.plan, self.clock = list(plan), clock
+        self._past = Measured()
+        self._running: PlannedPhase | None = None
+        self._total, self._first, self._share, self._began, self._heard = 1.0, 0.0, 0.0, 0.0, 0.0
+        self._end: float | None = None
+        self._work: Mapping[str, Work] = {}
+
+    def begin(self, phase: Phase) -> None:
+        """A phase begins: those before it are over. One that the plan does not know takes no time in it."""
+        self._end_running()
+        places = [i for i, one in enumerate(self.plan) if (one.name, one.member) == (phase.name, phase.member)]
+        if places:
+            self._running, self.plan = self.plan[places[0]], self.plan[places[0] + 1 :]
+            self._total, self._began, self._work = phase.total or 1.0, self.clock(), {}
+            self._heard, self._end = self._began, None
+            self._first = self._share = min(1.0, phase.done / self._total)
+
+    def update(self, done: float, *, ends_at: float | None = None, work: Mapping[str, Work] | None = None) -> None:
+        """So much of the running phase's total is done; `ends_at`: where it will end as things stand; `work`, by kind,
+        since it began, where that is known."""
+        self._share, self._heard = min(1.0, done / self._total), self.clock()
+        self._end = None if ends_at is None else max(self._share, min(1.0, ends_at / self._total))
+        self._work = work or self._work
+
+    def seconds_left(self) -> float | None:
+        """Of the whole run, None as long as nothing was measured."""
+        now = self._measure()
+        if now.work.seconds < LEAST_SECONDS or now.work.cost <= 0.0:
+            return None
+        left = sum(now.predict_phase(phase) * now.expect_end(phase) for phase in self.plan)
+        if (running := self._running) is not None:
+            end = now.expect_end(running, self._share) if self._end is None else self._end
+            rest = now.predict_phase(running) * (end - self._share)
+            left += max(0.0, rest - (self.clock() - self._heard))
+        return left
+
+    def to_state(self) -> State:
+        """For a checkpoint: what was measured."""
+        now = self._measure()
+        return {
+            "work": vars(now.work),
+            "kinds": {kind: vars(spent) for kind, spent in now.kinds.items()},
+            "phases": {name: vars(spent) for name, spent in now.phases.items()},
+            "ends": now.ends,
+        }
+
+    def load_state(self, state: State) -> None:
+        """Go on from `to_state()`, as it was read: half as sure, since this may be another machine."""
+        past = Measured(ends={name: [float(end) for end in values] for name, values in state["ends"].items()})
+        past.work = _halve(state["work"])
+        past.kinds = {kind: _halve(spent) for kind, spent in state["kinds"].items()}
+        for name, spent in state["phases"].items():
+            costs = {kind: float(cost) / 2.0 for kind, cost in spent["costs"].items()}
+            past.phases[name] = SpentByKind(float(spent["seconds"]) / 2.0, costs)
+        self._past = past
+
+    def _measure(self) -> Measured:
+        """What was measured, the running phase included."""
+        now, share = deepcopy(self._past), self._share - self._first
+        if self._running is not None and share > 0.0:
+            now.add(self._running, share, self._heard - self._began, self._work)
+        return now
+
+    def _end_running(self) -> None:
+        if self._running is not None and self._share > self._first:
+            self._heard = self.clock()  # what followed the last update was of the phase too
+            self._past = self._measure()
+            self._past.ends.setdefault(self._running.name, []).append(self._share)
+        self._running = None
+
+
+def _halve(spent: Mapping[str, float]) -> Spent:
+    return Spent(float(spent["seconds"]) / 2.0, float(spent["cost"]) / 2.0)
+
 
 EVALUATION, REPORT_SECONDS, EVALUATED_SECONDS = "evaluation", 8.0, 4e-5
 """Its name, and what takes how long on a laptop's core: figures and pages, and each environment step."""

@@ -21,9 +21,8 @@ from popgen.methods.mappo.train import RllibTraining
 from popgen.methods.training import Phase, PlannedPhase, State, Work
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import plan_phases
-from popgen.pipelines import run_estimate
-from popgen.pipelines.run_estimate import RunEstimate, costs_of
-from popgen.pipelines.training_driver import plan_evaluation
+from popgen.pipelines import training_driver
+from popgen.pipelines.training_driver import RunEstimate, costs_of, plan_evaluation
 
 
 class Clock:
@@ -195,7 +194,7 @@ def spend(estimate: RunEstimate, clock: Clock, seconds: float, done: float, **mo
 def certain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measurements count alone."""
     for name in ("PRIOR_SECONDS", "KIND_SECONDS", "PHASE_SECONDS"):
-        monkeypatch.setattr(run_estimate, name, 1e-9)
+        monkeypatch.setattr(training_driver, name, 1e-9)
 
 
 @pytest.mark.usefixtures("certain")
