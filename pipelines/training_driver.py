@@ -36,7 +36,7 @@ from popgen.methods.training import (
 )
 from popgen.population import load_population
 from popgen.progress import Reporter
-from popgen.runs.checkpoints import CheckpointFiles, fitting, member_folder
+from popgen.runs.checkpoints import CheckpointFiles, fitting, member_folder, resolve_handles
 from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import wait_for_room
 
@@ -376,7 +376,7 @@ class TrainingDriver:
         state = left if checkpoint is None else checkpoint.state
         if "estimate" in state:  # one of an earlier version has none
             with fitting(self.checkpoints.folder):
-                self.estimate.load_state(state["estimate"])
+                self.estimate.load_state(resolve_handles(state["estimate"]))
         if not finished:
             return 1, None, checkpoint
         self._adopt_members(root, finished, present, left)

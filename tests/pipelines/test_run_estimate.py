@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,7 +23,10 @@ from popgen.methods.training import Phase, PlannedPhase, State, Work
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.member_training import plan_phases
 from popgen.pipelines import training_driver
+from popgen.pipelines.population import run_population
 from popgen.pipelines.training_driver import RunEstimate, costs_of, plan_evaluation
+from popgen.progress import NullReporter
+from popgen.runs.checkpoints import CheckpointFiles, resolve_handles
 
 
 class Clock:
@@ -255,6 +259,18 @@ def test_another_attempt_goes_on_with_what_was_measured() -> None:
     again.load_state(json.loads(json.dumps(estimate.to_state())))
     again.begin(Phase("play", 100, 5))
     assert spend(again, later, 3.0, 10) == pytest.approx(3.9 * 30.0, rel=0.1)
+
+
+def test_a_run_goes_on_after_a_finished_member_with_what_was_measured(tmp_path: Path) -> None:
+    """Trained in this process to its end, then the same command: the estimate comes from what the member left."""
+    words = ["method=xpm_sim", "env=rendezvous/mppmr", "scale=smoke", "population.size=1", "evaluation.episodes=1"]
+    words += ["run.transport=inline", "tracking=off", "run.id=r", f"run.root={tmp_path}", "xpm_sim.updates=2"]
+    for _ in range(2):
+        run_population(RunConfig.parse(compose(words)), reporter=NullReporter())
+    left = CheckpointFiles(tmp_path / "r", long=1, seconds=0.0).load_member(tmp_path / "r", 1)
+    estimate, _ = make_clocked([])
+    estimate.load_state(resolve_handles(left["estimate"]))
+    assert estimate.to_state()["kinds"]["simulated play"]["seconds"] > 0.0
 
 
 @pytest.mark.parametrize(
