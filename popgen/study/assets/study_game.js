@@ -194,8 +194,7 @@ class Game {
     const button = document.createElement("button");
     button.textContent = "Go on";
     button.addEventListener("click", () => this.onOver());
-    this.canvas.after(button);
-    button.focus();
+    this.canvas.after(button); // without the focus: a key that was meant for the game must not press it
   }
 
   closed(code) {
