@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -24,7 +23,7 @@ from popgen.evaluation.holdout_players import check_disjoint, open_sides
 from popgen.evaluation.partner_diversity import measure_partners
 from popgen.evaluation.played_games import PlayedGame, count_members, count_people
 from popgen.humans.humans_report import population_folder
-from popgen.humans.proxies import ProxySearch, fit_population
+from popgen.humans.proxies import ProxySearch, fit_missing_population
 from popgen.humans.recordings import LAYOUTS, load_games
 from popgen.pipelines.compare import HELD_SEED
 from popgen.pipelines.experiments import describe_population, measure_source, open_sources
@@ -231,12 +230,7 @@ def measure_human(job: RunToMeasure) -> dict[str, Any]:
 def find_proxy(job: RunToMeasure, layout: str) -> Path:
     """The population of a layout's proxy of half B; fitted where it is not there yet."""
     path = population_folder(job.humans, layout, "B")
-    if not path.is_dir():
-        unfinished = path.with_name(f".{path.name}")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        fit_population(unfinished, layout, "B", seed=SEED, search=ProxySearch(**job.proxy))
-        unfinished.rename(path)
-    return path
+    return fit_missing_population(path, layout, "B", seed=SEED, search=ProxySearch(**job.proxy))
 
 
 def measure_conventions(job: RunToMeasure) -> dict[str, Any]:

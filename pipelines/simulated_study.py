@@ -14,7 +14,7 @@ from popgen.durable_files import replace_file
 from popgen.errors import UserError
 from popgen.evaluation.convention_effects import tabulate_effects
 from popgen.evaluation.played_games import PlayedGame, count_table_games
-from popgen.humans.proxies import fit_population
+from popgen.humans.proxies import fit_missing_population
 from popgen.humans.record_tables import read_table_games
 from popgen.policies.portable_program import write_program
 from popgen.population import load_population
@@ -86,7 +86,8 @@ def _simulate_study(wanted: StudyToSimulate, folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     study = _make_study(wanted, folder)
     size = wanted.size
-    people = [] if size.random_keys else [_fit_people(wanted.folder, layout) for layout in study.definition.layouts]
+    layouts = [] if size.random_keys else study.definition.layouts
+    people = [fit_missing_population(wanted.folder / "people" / layout, layout, HALF) for layout in layouts]
     plan = DryRunPlan(participants=size.participants, together=TOGETHER, seed=wanted.seed)
     casting = Casting(study, [load_population(path) for path in people])
     found = run_dry(study, casting, plan, lambda done: None)
@@ -118,17 +119,6 @@ def _has_program(one: NamedMember) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _fit_people(folder: Path, layout: str) -> Path:
-    """Clones of the people who were recorded in a layout, fitted once."""
-    path = folder / "people" / layout
-    if not path.exists():
-        part = path.with_name(f"{layout}.part")
-        shutil.rmtree(part, ignore_errors=True)
-        fit_population(part, layout, HALF)
-        part.rename(path)
-    return path
 
 
 def _write_tables(folder: Path) -> None:

@@ -166,7 +166,7 @@ class RunEstimate:
 
     def seconds_left(self) -> float | None:
         """Of the whole run, None as long as nothing was measured."""
-        now = self._measure()
+        now = self._measure_work()
         if now.work.seconds < LEAST_SECONDS or now.work.cost <= 0.0:
             return None
         left = sum(now.predict_phase(phase) * now.expect_end(phase) for phase in self.plan)
@@ -178,7 +178,7 @@ class RunEstimate:
 
     def to_state(self) -> State:
         """For a checkpoint: what was measured."""
-        now = self._measure()
+        now = self._measure_work()
         return {
             "work": vars(now.work),
             "kinds": {kind: vars(spent) for kind, spent in now.kinds.items()},
@@ -189,14 +189,14 @@ class RunEstimate:
     def load_state(self, state: State) -> None:
         """Go on from `to_state()`, as it was read: half as sure, since this may be another machine."""
         past = Measured(ends={name: [float(end) for end in values] for name, values in state["ends"].items()})
-        past.work = _halve(state["work"])
-        past.kinds = {kind: _halve(spent) for kind, spent in state["kinds"].items()}
+        past.work = _halve_spent(state["work"])
+        past.kinds = {kind: _halve_spent(spent) for kind, spent in state["kinds"].items()}
         for name, spent in state["phases"].items():
             costs = {kind: float(cost) / 2.0 for kind, cost in spent["costs"].items()}
             past.phases[name] = SpentByKind(float(spent["seconds"]) / 2.0, costs)
         self._past = past
 
-    def _measure(self) -> Measured:
+    def _measure_work(self) -> Measured:
         """What was measured, the running phase included."""
         now, share = deepcopy(self._past), self._share - self._first
         if self._running is not None and share > 0.0:
@@ -206,12 +206,12 @@ class RunEstimate:
     def _end_running(self) -> None:
         if self._running is not None and self._share > self._first:
             self._heard = self.clock()  # what followed the last update was of the phase too
-            self._past = self._measure()
+            self._past = self._measure_work()
             self._past.ends.setdefault(self._running.name, []).append(self._share)
         self._running = None
 
 
-def _halve(spent: Mapping[str, float]) -> Spent:
+def _halve_spent(spent: Mapping[str, float]) -> Spent:
     return Spent(float(spent["seconds"]) / 2.0, float(spent["cost"]) / 2.0)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -200,6 +201,18 @@ def fit_population(
         proxies.append(proxy)
         tell((number + 1) / members)
     return proxies
+
+
+def fit_missing_population(
+    path: Path, layout: str, half: str, *, seed: int = 0, search: ProxySearch | None = None
+) -> Path:
+    """The population at `path`, fitted where it is not there; one that was broken off is begun anew."""
+    if not path.is_dir():
+        unfinished = path.with_name(f".{path.name}")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        fit_population(unfinished, layout, half, seed=seed, search=search)
+        unfinished.rename(path)
+    return path
 
 
 def _describe_source(

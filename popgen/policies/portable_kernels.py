@@ -26,7 +26,7 @@ LEAK = 0.009999999776482582
 
 
 @compile_helper
-def _exp(x):
+def _take_exp(x):
     """e to the power of x <= 0: a polynomial of what is left of x after whole powers of 2."""
     if not x > LEAST_EXPONENT:
         return 0.0
@@ -39,16 +39,16 @@ def _exp(x):
 
 
 @compile_helper
-def _sigmoid(x):
+def _take_sigmoid(x):
     if x >= 0.0:
-        return 1.0 / (1.0 + _exp(-x))
-    share = _exp(x)
+        return 1.0 / (1.0 + _take_exp(-x))
+    share = _take_exp(x)
     return share / (1.0 + share)
 
 
 @compile_helper
-def _tanh(x):
-    share = _exp(-2.0 * abs(x))
+def _take_tanh(x):
+    share = _take_exp(-2.0 * abs(x))
     value = (1.0 - share) / (1.0 + share)
     return value if x >= 0.0 else -value
 
@@ -85,11 +85,11 @@ def apply_activation(kind, values):
     for i in range(values.shape[0]):
         x = values[i]
         if kind == 0:
-            values[i] = _tanh(x)
+            values[i] = _take_tanh(x)
         elif kind == 1:
             values[i] = x if x >= 0.0 else x * LEAK
         else:
-            values[i] = x * _sigmoid(x)
+            values[i] = x * _take_sigmoid(x)
 
 
 @compile_kernel
@@ -97,9 +97,9 @@ def advance_gru(inputs, recurrent, memory):
     """PyTorch's GRU from the gates (3 U) of input and memory; memory (U,) in place."""
     units = memory.shape[0]
     for u in range(units):
-        reset = _sigmoid(inputs[u] + recurrent[u])
-        update = _sigmoid(inputs[units + u] + recurrent[units + u])
-        candidate = _tanh(inputs[2 * units + u] + reset * recurrent[2 * units + u])
+        reset = _take_sigmoid(inputs[u] + recurrent[u])
+        update = _take_sigmoid(inputs[units + u] + recurrent[units + u])
+        candidate = _take_tanh(inputs[2 * units + u] + reset * recurrent[2 * units + u])
         memory[u] = candidate + update * (memory[u] - candidate)
 
 
@@ -108,8 +108,8 @@ def advance_norm_gru(gates, memory):
     """`popgen.nets.blocks.NormGRUCell` from its normalised gates (3 U); memory (U,) in place."""
     units = memory.shape[0]
     for u in range(units):
-        candidate = _tanh(_sigmoid(gates[u]) * gates[units + u])
-        update = _sigmoid(gates[2 * units + u] - 1.0)
+        candidate = _take_tanh(_take_sigmoid(gates[u]) * gates[units + u])
+        update = _take_sigmoid(gates[2 * units + u] - 1.0)
         memory[u] = memory[u] + update * (candidate - memory[u])
 
 
@@ -134,7 +134,7 @@ def fill_probabilities(logits, uniform_share, out):
     for a in range(1, count):
         most = max(most, logits[a])
     for a in range(count):
-        out[a] = _exp(logits[a] - most)
+        out[a] = _take_exp(logits[a] - most)
         total += out[a]
     for a in range(count):
         out[a] = out[a] / total * (1.0 - uniform_share) + uniform_share / count

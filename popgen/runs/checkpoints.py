@@ -385,9 +385,9 @@ class CheckpointFiles:
         state = self.writer.ask(CheckpointWriter.load, member).result()
         if state is None:
             return None
-        return Checkpoint(state, self.writer.ask(CheckpointWriter.buffers).result(), self._log())
+        return Checkpoint(state, self.writer.ask(CheckpointWriter.buffers).result(), self._read_log())
 
-    def _log(self) -> Iterator[tuple[Segments, int]]:
+    def _read_log(self) -> Iterator[tuple[Segments, int]]:
         while (entry := self.writer.ask(CheckpointWriter.read_log).result()) is not None:
             yield entry
 

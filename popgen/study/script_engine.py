@@ -134,18 +134,18 @@ def _make_handler(tasks: queue.Queue[bytes], results: queue.Queue[bytes]) -> typ
         def do_GET(self) -> None:
             """The page, a script, or the next task."""
             if self.path == "/next":
-                self._answer("application/octet-stream", tasks.get())
+                self._send_answer("application/octet-stream", tasks.get())
             elif self.path in pages:
-                self._answer(*pages[self.path])
+                self._send_answer(*pages[self.path])
             else:
                 self.send_error(404)
 
         def do_POST(self) -> None:
             """A result."""
             results.put(self.rfile.read(int(self.headers["Content-Length"])))
-            self._answer("text/plain", b"")
+            self._send_answer("text/plain", b"")
 
-        def _answer(self, kind: str, content: bytes) -> None:
+        def _send_answer(self, kind: str, content: bytes) -> None:
             self.send_response(200)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(content)))

@@ -151,10 +151,10 @@ class SimulatedParticipant:
                 return True
             await self._play()
         else:
-            await self._call("answers", {"form": state["form"], "answers": self._answer(state["questions"])})
+            await self._call("answers", {"form": state["form"], "answers": self._answer_questions(state["questions"])})
         return False
 
-    def _answer(self, questions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    def _answer_questions(self, questions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         right = {question.key: question.answer for question in self._study.definition.check}
         drawn = {one["key"]: str(self._rng.choice(one["options"])) for one in questions}
         return {key: right.get(key) or value for key, value in drawn.items()}
@@ -162,7 +162,7 @@ class SimulatedParticipant:
     async def _call(self, name: str, body: Any = None) -> dict[str, Any]:
         return await asyncio.to_thread(self._send_request, name, body)
 
-    def _fetch(self, name: str) -> bytes:
+    def _fetch_file(self, name: str) -> bytes:
         with self._opener.open(f"http://{self._address}/api/{name}", timeout=60) as answer:
             return answer.read()
 
@@ -212,7 +212,7 @@ class SimulatedParticipant:
     async def _play_here(self, line: Any, facts: Mapping[str, Any]) -> None:
         """A game whose rules and partner run on this side, as in a browser; in real time where the study has any."""
         env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
-        program = read_program(await asyncio.to_thread(self._fetch, "partner"))
+        program = read_program(await asyncio.to_thread(self._fetch_file, "partner"))
         game = HostedGame(env, ProgramRunner(program, env.spec.num_actions), facts["seat"], facts["seed"])
         if game.repeat(np.array(facts["actions"], np.uint8).reshape(-1, 2)) is not None:
             raise UserError(self._address, "sent a game that its partner does not play so", "report it")
@@ -265,10 +265,10 @@ class PlayedHere:
             if len(self._batch) >= size:
                 await self._send_batch()
             while self._game.step - self._kept > ahead and not self._over:
-                await self._hear()
+                await self._hear_server()
         await self._send_batch()
         while not self._over:
-            await self._hear()
+            await self._hear_server()
 
     def _play_step(self, late: float, first: bool, began: float) -> None:
         game, seat = self._game, self._facts["seat"]
@@ -289,7 +289,7 @@ class PlayedHere:
             await self._line.send(json.dumps({"steps": self._batch}, separators=(",", ":")))
             self._batch = []
 
-    async def _hear(self) -> None:
+    async def _hear_server(self) -> None:
         told = json.loads(await self._line.recv())
         self._kept = told.get("kept", self._kept)
         self._over = self._over or "over" in told

@@ -15,6 +15,7 @@ from support.finished import finished_run
 import popgen.pipelines as pipelines
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
+from popgen.humans import proxies
 from popgen.pipelines import run_measures
 from popgen.pipelines.run_measures import RunToMeasure, measure_costs, measure_curves, measure_held, measure_scores
 
@@ -194,7 +195,7 @@ def test_an_ego_is_measured_beside_the_clone_of_people_that_is_fitted_once(
         asked.append((layout, half, search.drawn))
         shutil.copytree(folder / "population", path)
 
-    monkeypatch.setattr(run_measures, "fit_population", fit)
+    monkeypatch.setattr(proxies, "fit_population", fit)
     (tmp_path / "humans" / ".cramped_room_B").mkdir(parents=True)
     job = RunToMeasure(folder, "XPM-WM", 2, {}, humans=tmp_path / "humans", proxy={"drawn": 3})
     assert run_measures.measure_human(job)["score"] >= 0.0 and run_measures.measure_human(job)["score"] < 2.0

@@ -1,4 +1,4 @@
-"""XPM-WM: the world model, the agents on it, and the two phases. The defaults are the laptop's recipe."""
+"""XPM-WM: the world model, the agents on it, and the two phases. The laptop's recipe says what differs from here."""
 
 from __future__ import annotations
 
