@@ -6,6 +6,7 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,9 @@ def add(commands: Any) -> None:
     parser.add_argument("--budget", default=DEFAULT_BUDGET, metavar="NAME", help="smoke, laptop or paper (%(default)s)")
     parser.add_argument(
         "--seeds", type=at_least(1), nargs="+", default=None, metavar="N", help="of training (the budget's)"
+    )
+    parser.add_argument(
+        *("--layouts",), nargs="+", default=None, metavar="NAME", help="of targets with several layouts (the budget's)"
     )
     parser.add_argument("--out", default="reproduction", metavar="DIR", help="of all pieces (%(default)s)")
     parser.add_argument(
@@ -90,11 +94,12 @@ def _plan_pieces(args: argparse.Namespace) -> Pieces:
     from popgen.reports.reproduction.target_registry import find_targets
     from popgen.runs.preflight import check_root
 
-    budget = find_budget(args.budget)
+    budget = find_budget(args.budget, args.layouts)
     targets, out = find_targets(args.target), Path(args.out)
     check_root(out, 256 * 2**20, "--out")
     seeds = list(dict.fromkeys(args.seeds or budget.seeds))
     words = ["popgen", "reproduce", args.target, *args.overrides, "--budget", budget.name, "--seeds", *map(str, seeds)]
+    words += ["--layouts", *args.layouts] if args.layouts else []
     plan = Plan(
         targets,
         budget,
@@ -109,17 +114,23 @@ def _plan_pieces(args: argparse.Namespace) -> Pieces:
     return Pieces(plan)
 
 
-def find_budget(name: str) -> Budget:
-    """A budget by name.
+def find_budget(name: str, layouts: Sequence[str] | None = None) -> Budget:
+    """A budget by name; with other layouts than its own, named with or without `overcooked/`.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such budget or layout.
     """
     from popgen.reports.reproduction.target_registry import BUDGETS
 
     if name not in BUDGETS:
         raise UserError("--budget", f"there is no budget {name!r}", f"choose one of {', '.join(BUDGETS)}")
-    return BUDGETS[name]
+    if not layouts:
+        return BUDGETS[name]
+    known = {environment.partition("/")[2]: environment for environment in BUDGETS["paper"].layouts}
+    short = list(dict.fromkeys(layout.removeprefix("overcooked/") for layout in layouts))
+    if unknown := [layout for layout in short if layout not in known]:
+        raise UserError("--layouts", f"the paper has no layout {unknown[0]!r}", f"choose from {', '.join(known)}")
+    return replace(BUDGETS[name], layouts=tuple(known[layout] for layout in short))
 
 
 def _make_composer(shared: Sequence[str], config_dir: str | None) -> Any:

@@ -116,6 +116,16 @@ def test_targets_share_their_runs(run: Run, training: Training) -> None:
     assert code == 0 and len(training.calls) == 4 and json.loads(out)["targets"][0]["runs"] == 4
 
 
+def test_other_layouts_than_the_budgets(run: Run, training: Training, tmp_path: Path) -> None:
+    layouts = ("--layouts", "forced_coordination", "overcooked/coordination_ring")
+    assert run("reproduce", "sp-xp", *SMALL, *layouts)[0] == 0
+    wanted = ["overcooked/forced_coordination"] * 4 + ["overcooked/coordination_ring"] * 4
+    assert [config.env.name for config in training.calls] == wanted
+    assert json.loads((tmp_path / "out" / "sp-xp" / "record.json").read_text())["command"].endswith(" ".join(layouts))
+    code, _, err = run("reproduce", "sp-xp", *SMALL, "--layouts", "kitchen")
+    assert code == 2 and "--layouts" in err and "choose from cramped_room" in err and len(training.calls) == 8
+
+
 def test_a_run_that_fails_holds_up_nothing_but_itself(run: Run, training: Training, tmp_path: Path) -> None:
     training.refused = {"lipo"}
     code, _, err = run("reproduce", "wall-clock", *SMALL)
