@@ -30,14 +30,14 @@ from popgen.methods.training import (
 )
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import FcpWmRun, WorldModelRun
-from popgen.methods.xpm_wm.imagination import OLD, Starts
+from popgen.methods.xpm_wm.imagination import OLD
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.real_play import MemberWeights, Tally, TallyKeeper
 from popgen.methods.xpm_wm.replay import Draws, Query, Replay, Request, Windows, draw, join, model_batch, start_batch
 from popgen.methods.xpm_wm.skilled_training import FcpWmTraining
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner
+from popgen.methods.xpm_wm.world_model import ModelLearner, Starts
 from popgen.nets.weights import Weights, prefixed, under, weights_of
 from popgen.play.rollout import Match
 from popgen.types import Kind, Segment

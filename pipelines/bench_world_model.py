@@ -17,7 +17,7 @@ from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import XpmWmRun
 from popgen.methods.xpm_wm.imagination import OLD
 from popgen.methods.xpm_wm.replay import Query, Replay, Windows
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner
+from popgen.methods.xpm_wm.world_model import ModelLearner
 from popgen.nets.weights import weights_of
 from popgen.play.rollout import Match, Sampler
 from popgen.policies.simple_policies import RandomPolicy

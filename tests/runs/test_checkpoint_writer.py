@@ -10,7 +10,7 @@ import pytest
 from support.small import kitchen, random_play
 
 from popgen.methods.training import Ready, Segments
-from popgen.methods.xpm_wm.imagination import Starts
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.runs.checkpoints import CheckpointFiles, resolve_handles
 from popgen.runs.state_files import load_state
 from popgen.types import Kind

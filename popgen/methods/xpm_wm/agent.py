@@ -7,25 +7,26 @@ By REINFORCE, as in the paper, or by PPO's clipped surrogate in several passes o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec
-from popgen.losses.policy_losses import geometric, linear
-from popgen.methods.xpm_wm.actor_critic import Actor
-from popgen.methods.xpm_wm.agent_update import (
-    AgentNetworks,
-    PolicyTarget,
-    cast_automatically,
-    cross_play_target,
-    learn_batch,
-    self_play_target,
+from popgen.losses.policy_losses import (
+    bound_advantage,
+    clipped_loss,
+    geometric,
+    lambda_return,
+    linear,
+    reinforce,
+    signed_advantage,
 )
+from popgen.methods.xpm_wm.actor_critic import SELF, Actor, AgentNetworks
 from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig, WorldModelConfig
 from popgen.methods.xpm_wm.imagination import (
     NEW_SP,
@@ -33,7 +34,7 @@ from popgen.methods.xpm_wm.imagination import (
     Imagined,
     ImaginedPlay,
     JointActor,
-    Starts,
+    Samples,
     cross_play_seats,
     draw_start_rows,
     expected_pay,
@@ -44,9 +45,10 @@ from popgen.methods.xpm_wm.imagination import (
 from popgen.methods.xpm_wm.imagined_surprise import surprise_bonus
 from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.real_play import Tally
-from popgen.methods.xpm_wm.world_model import WorldModel
+from popgen.methods.xpm_wm.world_model import Starts, WorldModel
 from popgen.nets import weights as w
 from popgen.play.partner_strength import PartnerConstraint, any_or_strongest
+from popgen.types import Kind
 
 
 def cross_play_weight(config: AgentConfig, updates: int) -> float:
@@ -81,6 +83,185 @@ def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) ->
         native = torch.cuda.is_bf16_supported if device.type == "cuda" else cpu
         precision = "bfloat16" if native() else "float32"
     return getattr(torch, precision)
+
+
+# ---- targets and losses ----------------------------------------------------------------------------------------------
+
+
+LEAST_SPREAD = 0.1
+"""Of self-play's advantages, in units of reward: where nothing is at stake, noise is not blown up."""
+
+
+class ReturnTargets(NamedTuple):
+    """Lambda-returns (H, B) and values (H + 1, B), without gradient."""
+
+    returns: Float[Tensor, "H B"]
+    value: Float[Tensor, "T B"]
+
+
+@torch.no_grad()
+def estimate_returns(networks: AgentNetworks, imagined: Imagined, key: int, seat: Int[Tensor, "T B"]) -> ReturnTargets:
+    """Lambda-returns under the slow critic of `key`, which is told the agent's seat."""
+    value = networks.critic(key, slow=True).value(imagined.latent, seat)
+    discount = networks.config.discount * imagined.keep
+    return ReturnTargets(lambda_return(imagined.reward, value, discount, networks.config.lam), value)
+
+
+@dataclass(frozen=True)
+class PolicyTarget:
+    """What one kind of imagined play teaches.
+
+    Attributes:
+        samples: for the policy and for the critic of that play.
+        unit: of all advantages of the update, which self-play sets.
+        figures: for the logs.
+    """
+
+    samples: Samples
+    unit: Tensor
+    figures: dict[str, float]
+
+
+class Losses(NamedTuple):
+    """Of the policy and of a critic, to be minimised, and the policy's figures."""
+
+    policy: Float[Tensor, ""]
+    critic: Float[Tensor, ""]
+    figures: dict[str, float]
+
+
+class PolicyTerms(NamedTuple):
+    """Log-probability of the actions taken, and entropy."""
+
+    log_prob: Float[Tensor, "R K"]
+    entropy: Float[Tensor, "R K"]
+
+
+def self_play_target(networks: AgentNetworks, imagined: Imagined, entropy_scale: float) -> PolicyTarget:
+    """+J_SP. The unit of all advantages is the range of the returns, or the advantages' spread."""
+    steps, batch = imagined.reward.shape
+    players = torch.tensor([0, 1], device=networks.device).expand(batch, 2)
+    returns, value = estimate_returns(networks, imagined, SELF, players[:, 0].expand(steps + 1, batch))
+    advantage, scale = returns - value[:-1], networks.scale.update(returns)
+    unit = scale
+    if networks.config.advantage_unit == "spread":  # centred as usual: a shift of all advantages only adds noise
+        running = advantage[imagined.running > 0.5]
+        advantage, unit = advantage - running.mean(), running.std().clamp(min=LEAST_SPREAD)
+        if networks.config.advantage_clip:
+            advantage, unit = clip_advantages(advantage, imagined.running > 0.5, networks.config.advantage_clip)
+    signed = signed_advantage(Kind.SP, advantage, weight=1.0, scale=unit)
+    figures = {
+        "entropy_scale": entropy_scale,
+        "return_scale": float(scale),
+        "imagined_shaped_sp": float(imagined.reward.mean()),
+        "imagined_return_sp": float(returns.mean()),
+        "value_sp": float(value.mean()),
+        "advantage_sp": float(advantage.std()),
+    }
+    samples = Samples.from_imagined(imagined, SELF, players, returns, signed, entropy_scale)
+    return PolicyTarget(add_log_probs(networks, samples), unit, figures)
+
+
+def clip_advantages(
+    advantage: Float[Tensor, "H B"], running: Bool[Tensor, "H B"], times: float
+) -> tuple[Float[Tensor, "H B"], Float[Tensor, ""]]:
+    """Centred advantages cut at so many `times` their mean magnitude in running states, and their spread then."""
+    bound = times * advantage[running].abs().mean()
+    cut = advantage.clamp(-bound, bound)
+    return cut, cut[running].std().clamp(min=LEAST_SPREAD)
+
+
+def cross_play_target(
+    networks: AgentNetworks,
+    imagined: Imagined,
+    partner: int,
+    seats: Int[Tensor, " B"],
+    *,
+    unit: Float[Tensor, ""],
+    weight: float,
+    entropy_scale: float,
+) -> PolicyTarget:
+    """-lambda_XP J_XP with `partner`, in self-play's `unit`, at most `agent.xp_clip` of them; `weight` is lambda_XP."""
+    steps, batch = imagined.reward.shape
+    returns, value = estimate_returns(networks, imagined, partner, seats.expand(steps + 1, batch))
+    advantage = returns - value[:-1]
+    bounded = bound_advantage(advantage, clip=networks.config.xp_clip, spread=unit)
+    signed = signed_advantage(Kind.XP, bounded, weight=weight, scale=unit)
+    figures = {
+        "imagined_shaped_xp": float(imagined.reward.mean()),
+        "imagined_return_xp": float(returns.mean()),
+        "advantage_xp": float(advantage.std()),
+        "lambda": weight,
+        "partner": float(partner),
+    }
+    samples = Samples.from_imagined(imagined, partner, seats.unsqueeze(-1), returns, signed, entropy_scale)
+    return PolicyTarget(add_log_probs(networks, samples), unit, figures)
+
+
+def add_log_probs(networks: AgentNetworks, samples: Samples) -> Samples:
+    """With those of the actions under the present policy, where the surrogate compares with them."""
+    if networks.config.surrogate == "reinforce":
+        return samples
+    with torch.no_grad():
+        return replace(samples, log_prob=policy_terms(networks.actor, samples).log_prob)
+
+
+def policy_terms(actor: Actor, samples: Samples) -> PolicyTerms:
+    """Log-probability of the actions taken and entropy under `actor`."""
+    latent, seats = samples.latent, samples.seats
+    shown = Latent(*(x.unsqueeze(1).expand(*seats.shape, x.shape[-1]) for x in (latent.h, latent.z)))
+    log_probs = actor.log_probs(shown, seats)
+    taken = log_probs.gather(-1, samples.actions.unsqueeze(-1)).squeeze(-1)
+    return PolicyTerms(taken, -(log_probs.exp() * log_probs).sum(-1))
+
+
+def sample_losses(networks: AgentNetworks, samples: Samples) -> Losses:
+    """Of the policy and of the critic of the samples."""
+    log_prob, entropy = policy_terms(networks.actor, samples)
+    advantage, running = samples.advantage.unsqueeze(-1), samples.running.unsqueeze(-1)
+    figures, clip = {"entropy": float(entropy.detach().mean())}, networks.config.clip
+    if samples.log_prob is None:
+        policy = reinforce(log_prob, advantage, entropy, running, entropy_scale=samples.entropy_scale)
+    else:
+        terms = (log_prob, samples.log_prob, advantage, entropy, running)
+        policy = clipped_loss(*terms, clip=clip, entropy_scale=samples.entropy_scale)
+        change = (log_prob.detach() - samples.log_prob).exp() - 1.0
+        figures["clipped"] = float((change.abs() > clip).float().mean())
+    errors = networks.critic(samples.key).loss(samples.latent, samples.seat, samples.returns)
+    return Losses(policy, (samples.running * errors).mean(), figures)
+
+
+# ---- gradient steps --------------------------------------------------------------------------------------------------
+
+
+def cast_automatically(networks: AgentNetworks) -> torch.autocast:
+    """Products in bfloat16 where the networks' rollouts are."""
+    return torch.autocast(networks.device.type, torch.bfloat16, enabled=networks.dtype is torch.bfloat16)
+
+
+def learn_batch(networks: AgentNetworks, samples: Sequence[Samples], generator: torch.Generator) -> dict[str, float]:
+    """`epochs` passes over the batch in `minibatches`, of every kind of samples its share; mean figures."""
+    config, totals = networks.config, []
+    for _ in range(config.epochs):
+        parts = [part.minibatches(config.minibatches, generator) for part in samples]
+        totals += [step_networks(networks, together) for together in zip(*parts, strict=True)]
+    return {name: float(np.mean([figures[name] for figures in totals])) for name in totals[0]}
+
+
+def step_networks(networks: AgentNetworks, parts: Sequence[Samples]) -> dict[str, float]:
+    """One step of the actor and of the critics that the samples are of."""
+    with cast_automatically(networks):
+        losses = [sample_losses(networks, part) for part in parts]
+    zero = torch.zeros((), device=networks.device)
+    networks.step_actor(sum((loss.policy for loss in losses), zero))
+    networks.step_critics(sum((loss.critic for loss in losses), zero))
+    figures = losses[0].figures  # of the policy in self-play
+    for part, loss in zip(parts, losses, strict=True):
+        figures["critic_loss_sp" if part.key == SELF else "critic_loss_xp"] = float(loss.critic.detach())
+    return figures
+
+
+# ---- the learner -----------------------------------------------------------------------------------------------------
 
 
 class AgentLearner:

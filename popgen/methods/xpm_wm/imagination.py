@@ -1,4 +1,5 @@
-"""Imagination: states to start from, the prior rolled forward under joint actors, what it pays, and what is believed.
+"""Imagination: states to start from, the prior rolled forward under joint actors, what it pays, what is learned from
+it, and what is believed.
 
 The rollout is Algorithm 1's lines 8 and 10. `Discovery` is for tasks where a reward lies behind a long chain of events
 that play does not show yet (docs/notes/learning.md, The counter circuit): a bonus for states of a player that real play
@@ -9,7 +10,7 @@ that end where the model has seen too little to go on.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,30 +23,9 @@ from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig
 from popgen.methods.xpm_wm.latent_filter import Latent, from_indices
 from popgen.methods.xpm_wm.real_play import Tally, part_weights
 from popgen.methods.xpm_wm.replay import NEW_SP, NEW_XP, OLD
-from popgen.methods.xpm_wm.world_model import PlayerDecoder, WorldModel
+from popgen.methods.xpm_wm.world_model import PlayerDecoder, Starts, WorldModel
 
 # ---- states to start from --------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Starts:
-    """Posteriors of real states. h (N, D) float32; z (N, G) uint8 class indices; pool (N,) uint8: OLD data of
-    earlier members and random play, NEW_SP, NEW_XP; partner (N,) int16 of cross-play rows, 0 elsewhere.
-    """
-
-    h: np.ndarray
-    z: np.ndarray
-    pool: np.ndarray
-    partner: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.pool)
-
-    @staticmethod
-    def concat(parts: list[Starts]) -> Starts:
-        """All parts in order."""
-        columns = ("h", "z", "pool", "partner")
-        return Starts(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
 def draw_self_play(
@@ -192,6 +172,77 @@ def joint_actor(own: Actor, partner: Actor | None, first: int, seats: Tensor, ge
         return actions
 
     return act
+
+
+# ---- what is learned from it -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Samples:
+    """R imagined states of one pair of policies; no gradient flows into them.
+
+    key: of the critic that learns from them.
+    latent: (R, .), seat: (R,) int64, what that critic sees; returns: (R,), its targets.
+    seats, actions: (R, K) int64, where the member sat and what it did: K is 2 in self-play, 1 in cross-play.
+    advantage: (R,), with the objective's sign, weight and unit.
+    running: (R,), probability that the imagined episode still runs.
+    entropy_scale: of the bonus in these states.
+    log_prob: (R, K), of the actions under the policy that took them; None where one step is taken on the whole batch.
+    """
+
+    key: int
+    latent: Latent
+    seat: Tensor
+    returns: Tensor
+    seats: Tensor
+    actions: Tensor
+    advantage: Tensor
+    running: Tensor
+    entropy_scale: float
+    log_prob: Tensor | None = None
+
+    @staticmethod
+    def from_imagined(
+        imagined: Imagined, key: int, seats: Tensor, returns: Tensor, advantage: Tensor, entropy_scale: float
+    ) -> Samples:
+        """Trajectories (H, B) in one row each: `seats` (B, K) int64 are the member's, the critic is told the first."""
+        steps, batch = imagined.reward.shape
+        seats = seats.expand(steps, batch, -1)
+        latent, actions = imagined.latent[:-1], imagined.actions.gather(-1, seats)
+        return Samples(
+            key=key,
+            latent=Latent(latent.h.flatten(0, 1), latent.z.flatten(0, 1)),
+            seat=seats[..., 0].flatten(0, 1),
+            returns=returns.flatten(0, 1),
+            seats=seats.flatten(0, 1),
+            actions=actions.flatten(0, 1),
+            advantage=advantage.flatten(0, 1),
+            running=imagined.running.flatten(0, 1),
+            entropy_scale=entropy_scale,
+        )
+
+    def __len__(self) -> int:
+        return len(self.returns)
+
+    def __getitem__(self, rows: Tensor) -> Samples:
+        return replace(
+            self,
+            latent=self.latent[rows],
+            seat=self.seat[rows],
+            returns=self.returns[rows],
+            seats=self.seats[rows],
+            actions=self.actions[rows],
+            advantage=self.advantage[rows],
+            running=self.running[rows],
+            log_prob=None if self.log_prob is None else self.log_prob[rows],
+        )
+
+    def minibatches(self, parts: int, generator: torch.Generator) -> list[Samples]:
+        """All rows in random order in so many parts; as they are if that is one."""
+        if parts == 1:
+            return [self]
+        order = torch.randperm(len(self), generator=generator, device=self.returns.device)
+        return [self[rows] for rows in torch.tensor_split(order, parts)]
 
 
 # ---- what is believed, and what real play has hardly seen ------------------------------------------------------------

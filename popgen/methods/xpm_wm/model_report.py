@@ -7,8 +7,7 @@ import torch
 from popgen.methods.xpm_wm.config import OPEN_LOOP
 from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.replay import Windows
-from popgen.methods.xpm_wm.world_model import WorldModel, event_counts
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner, WindowBatch
+from popgen.methods.xpm_wm.world_model import ModelLearner, WindowBatch, WorldModel, event_counts
 
 
 @torch.no_grad()

@@ -13,8 +13,8 @@ import numpy as np
 
 from popgen.methods.training import Pending, Phase, Progress, Round, Sampled, State
 from popgen.methods.xpm_wm.config import Phase1Config
-from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Put, Watch
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 

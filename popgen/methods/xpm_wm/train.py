@@ -13,10 +13,10 @@ from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sam
 from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
-from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.overlap import Overlap
 from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, ModelTask, ModelUpdate, Setup
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.config import WorldModelRun
-from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.real_play import MemberWeights, Tally
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.nets.weights import Weights
 from popgen.play.rollout import Match
 

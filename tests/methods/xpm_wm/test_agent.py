@@ -10,11 +10,11 @@ from support.small import AGENT, MODEL, kitchen, random_latent
 from torch import Tensor
 
 from popgen.losses.policy_losses import lambda_return
-from popgen.methods.xpm_wm.actor_critic import Actor
-from popgen.methods.xpm_wm.agent import AgentLearner, rollout_dtype
-from popgen.methods.xpm_wm.agent_update import SELF, sample_losses
-from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Imagined, Starts
+from popgen.methods.xpm_wm.actor_critic import SELF, Actor
+from popgen.methods.xpm_wm.agent import AgentLearner, estimate_returns, rollout_dtype, sample_losses
+from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Imagined
 from popgen.methods.xpm_wm.latent_filter import Latent
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.nets import weights as w
 from popgen.runs.state_files import load_state, save_state
 
@@ -289,7 +289,7 @@ def test_targets_are_lambda_returns_of_the_slow_critic() -> None:
     keep = torch.rand(3, 7, generator=generator)
     imagined = Imagined(random_latent(4, 7), torch.zeros(3, 7, 2, dtype=torch.long), torch.rand(3, 7), keep, keep)
     seat = torch.ones(4, 7, dtype=torch.long)
-    returns, value = learner.networks.targets(imagined, 2, seat)
+    returns, value = estimate_returns(learner.networks, imagined, 2, seat)
     torch.testing.assert_close(value, learner.networks.slow["2"].value(imagined.latent, seat))
     torch.testing.assert_close(returns, lambda_return(imagined.reward, value, 0.9 * keep, 0.8))
     assert value.abs().max() > 0.1 and not returns.requires_grad

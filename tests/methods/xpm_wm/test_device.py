@@ -16,9 +16,9 @@ from popgen.errors import UserError
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import OPEN_LOOP
-from popgen.methods.xpm_wm.imagination import NEW_XP, OLD, Starts
+from popgen.methods.xpm_wm.imagination import NEW_XP, OLD
 from popgen.methods.xpm_wm.model_report import model_report
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner
+from popgen.methods.xpm_wm.world_model import ModelLearner, Starts
 from popgen.nets import weights as w
 
 SPEC = kitchen().spec

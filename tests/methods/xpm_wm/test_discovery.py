@@ -10,8 +10,7 @@ import pytest
 import torch
 from support.small import AGENT, MODEL, kitchen, random_latent, random_play, random_windows
 
-from popgen.methods.xpm_wm.agent import entropy_scale
-from popgen.methods.xpm_wm.agent_update import clip_advantages
+from popgen.methods.xpm_wm.agent import clip_advantages, entropy_scale
 from popgen.methods.xpm_wm.config import DiscoveryConfig
 from popgen.methods.xpm_wm.imagination import (
     LEAST_TRUST,
@@ -22,8 +21,7 @@ from popgen.methods.xpm_wm.imagination import (
     trusted_shares,
 )
 from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper
-from popgen.methods.xpm_wm.world_model import WorldModel
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner, before_or_at
+from popgen.methods.xpm_wm.world_model import ModelLearner, WorldModel, before_or_at
 
 SPEC = kitchen().spec
 SOUP, DELIVERY = 3, 4

@@ -12,9 +12,9 @@ from support.small import AGENT, MODEL, kitchen, random_latent
 
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner, find_bonuses
-from popgen.methods.xpm_wm.imagination import OLD, Imagined, Starts
+from popgen.methods.xpm_wm.imagination import OLD, Imagined
 from popgen.methods.xpm_wm.imagined_surprise import joint_log_probs, surprise_bonus
-from popgen.methods.xpm_wm.world_model import WorldModel
+from popgen.methods.xpm_wm.world_model import Starts, WorldModel
 from popgen.nets import weights as w
 
 SPEC = kitchen().spec

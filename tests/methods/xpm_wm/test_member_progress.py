@@ -10,10 +10,10 @@ import pytest
 from popgen.methods.training import InlineTransport, Ready
 from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
-from popgen.methods.xpm_wm.imagination import Starts
 from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
 from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
 from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Tally, goes_by_tally, rare_events
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 from popgen.runs.checkpoints import resolve_handles

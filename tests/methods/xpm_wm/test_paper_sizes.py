@@ -11,9 +11,9 @@ from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.methods.xpm_wm.agent import AgentLearner
-from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Starts, draw_cross_play, draw_self_play
+from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, draw_cross_play, draw_self_play
 from popgen.methods.xpm_wm.replay import Query, model_batch, start_batch
-from popgen.methods.xpm_wm.world_model import WorldModel
+from popgen.methods.xpm_wm.world_model import Starts, WorldModel
 from popgen.types import Kind
 
 SMALL = ["world_model.units=8", "world_model.deter=8", "agent.units=8", "agent.layers=1"]

@@ -5,8 +5,7 @@ from dataclasses import replace
 import torch
 from support.small import random_latent
 
-from popgen.methods.xpm_wm.agent_update import Samples
-from popgen.methods.xpm_wm.imagination import Imagined
+from popgen.methods.xpm_wm.imagination import Imagined, Samples
 
 STEPS, BATCH = 2, 3
 

@@ -9,8 +9,7 @@ from support.small import MODEL, kitchen, random_latent, random_windows
 from popgen.errors import UserError
 from popgen.methods.xpm_wm.config import OPEN_LOOP, XpmWmRun
 from popgen.methods.xpm_wm.model_report import model_report
-from popgen.methods.xpm_wm.world_model import WorldModel, event_loss
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner
+from popgen.methods.xpm_wm.world_model import ModelLearner, WorldModel, event_loss
 
 SPEC = kitchen().spec
 SCALAR = MODEL.model_copy(update={"reward_head": "scalar"})

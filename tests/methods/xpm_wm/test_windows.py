@@ -5,8 +5,9 @@ import pytest
 
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
-from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Starts, draw_cross_play, draw_self_play
+from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, draw_cross_play, draw_self_play
 from popgen.methods.xpm_wm.replay import Draws, major_events, model_batch, start_batch
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.types import Kind
 
 SPEC = make_env("overcooked/cramped_room").spec

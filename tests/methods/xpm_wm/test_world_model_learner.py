@@ -14,8 +14,7 @@ from popgen.methods.xpm_wm.config import WorldModelConfig
 from popgen.methods.xpm_wm.latent_filter import from_indices
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.replay import KIND_CODE, Windows
-from popgen.methods.xpm_wm.world_model import LatentFilter, Observed, predecessor_kl
-from popgen.methods.xpm_wm.world_model_learner import ModelLearner, WindowBatch
+from popgen.methods.xpm_wm.world_model import LatentFilter, ModelLearner, Observed, WindowBatch, predecessor_kl
 from popgen.nets import weights as w
 from popgen.runs.state_files import load_state, save_state
 from popgen.types import Kind
