@@ -7,6 +7,8 @@ STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
 export RAY_USAGE_STATS_ENABLED := 0
 export MLFLOW_DISABLE_TELEMETRY := true
+# Without its cache every process compiles the code and the tests anew: half of the seconds before the first test.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: bench chaos clean demo docs format help install lint oracle test test-fast types
 
@@ -19,8 +21,8 @@ demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 test: install  ## all tests
 	$(PYTEST)
 
-test-fast: install  ## the tests without Ray (the oracle plays 2,000 steps of each layout, not 20,000)
-	POPGEN_ORACLE_STEPS=2000 $(PYTEST) -m "not ray"
+test-fast: install  ## without Ray and whole runs (the oracle plays 2,000 steps of each layout, not 20,000)
+	POPGEN_ORACLE_STEPS=2000 $(PYTEST) -m "not ray and not end_to_end"
 
 lint: install docs types  ## style, types and documentation
 	$(BIN)/ruff check .

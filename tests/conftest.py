@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
@@ -22,6 +23,15 @@ for _name, _value in {
 
 ROOT = Path(__file__).resolve().parent.parent
 WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line
+
+
+gc.disable()  # until all tests are imported: what they and their libraries are made of is never garbage
+
+
+def pytest_collection_finish() -> None:
+    """The collector runs again, and does not look at what was imported."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups

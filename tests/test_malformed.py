@@ -310,6 +310,7 @@ def test_a_damaged_run_is_not_gone_on_with(case: str, here: Path, capsys: pytest
     assert fingerprint(here.parent.parent) == before
 
 
+@pytest.mark.end_to_end
 def test_the_run_can_be_gone_on_with(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Undamaged, it ends well: what is refused above is the damage."""
     assert cli.main(["run", "--quiet", "--json", *RUN]) == 0

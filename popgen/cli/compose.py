@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,16 +83,26 @@ class Composed:
     Attributes:
         values: the plain dictionary, not yet checked by the schemas.
         recipe: what the recipe sets, by dotted field.
-        presets: dotted fields that a preset file sets -> the file's value and its name, such as env=overcooked/mine.
-        overridden: dotted fields that the command line sets.
+        overrides: of the command line, as Hydra reads them.
         schema: of the method.
+        config_dir: a user's folder of groups.
     """
 
     values: dict[str, Any]
     recipe: dict[str, SourcedSetting]
-    presets: dict[str, PresetValue]
-    overridden: tuple[str, ...]
+    overrides: tuple[str, ...]
     schema: type[RunConfig]
+    config_dir: Path | None
+
+    @property
+    def overridden(self) -> tuple[str, ...]:
+        """Dotted fields that the command line sets."""
+        return tuple(override.lstrip("+").partition("=")[0] for override in self.overrides)
+
+    @cached_property
+    def presets(self) -> dict[str, PresetValue]:
+        """Dotted fields that a preset file sets -> the file's value and its name, such as env=overcooked/mine."""
+        return _list_presets(self.overrides, self.config_dir)
 
 
 def compose(overrides: Sequence[str], config_dir: str | None = None) -> dict[str, Any]:
@@ -118,9 +129,7 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     recipe = recipes.get(name, recipes[DEFAULT_RECIPE])
     base = _merge(schema.model_validate({}).as_dict(), recipe.values(chosen["env"]["name"]))
     values = _compose(base, translated, overrides, folder, lambda key: unknown_field(key, schema))
-    keys = [override.lstrip("+").partition("=")[0] for override in translated]
-    layout = chosen["env"]["name"]
-    return Composed(values, recipe.list_settings(layout), _list_presets(translated, folder), tuple(keys), schema)
+    return Composed(values, recipe.list_settings(chosen["env"]["name"]), tuple(translated), schema, folder)
 
 
 def choose_custom_layout(words: Sequence[str]) -> list[str]:

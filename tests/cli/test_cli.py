@@ -408,6 +408,7 @@ def test_figures_that_are_not_finite_become_null(capsys: pytest.CaptureFixture[s
     assert json.loads(capsys.readouterr().out) == {"a": [None, None, [0, 1]], "b": "x", "3": 4}
 
 
+@pytest.mark.end_to_end
 @pytest.mark.parametrize(
     ("argv", "code"),
     [
@@ -429,6 +430,7 @@ def test_in_a_process_of_its_own_without_ray(argv: list[str], code: int, tmp_pat
     assert done.stderr.count("\n") == (1 if code else 0)
 
 
+@pytest.mark.end_to_end
 def test_as_a_module() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "popgen", "run", "scale=huge"], cwd=ROOT, capture_output=True, text=True, timeout=60

@@ -196,6 +196,13 @@ def give(newcomer: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]
     return call
 
 
+def test_every_command_is_one_that_popgen_reads() -> None:
+    for line in COMMANDS:
+        if line.startswith("popgen "):
+            parse(split_words(line)[1:])
+
+
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("line", [line for line in WITH_PLACE if re.match(r"popgen|make demo|jq", line.values[0])])
 def test_the_newcomers_path(line: str, newcomer: Path, give: Callable[[list[str]], None]) -> None:
     if line == "make demo":
@@ -233,6 +240,7 @@ def train_small(name: str, words: list[str], give: Callable[[list[str]], None]) 
     give([*(word for word in words if word.partition("=")[0] not in small), *(f"{k}={v}" for k, v in small.items())])
 
 
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("page", sorted({block.page for block in list_blocks() if block.language == "python"}))
 def test_python_of_a_page_runs_from_top_to_bottom(page: str, newcomer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import popgen

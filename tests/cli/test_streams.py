@@ -63,6 +63,7 @@ def test_work_goes_on_without_its_progress(streams: str, ends: int, tmp_path: Pa
     assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
 
 
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("streams", [">&-", "2>&-", "<&-", "<&- >&- 2>&-", "| head -n 0"])
 def test_results_without_a_reader_are_no_error(streams: str, tmp_path: Path, random_population: Path) -> None:
     done = in_shell(f'"$PYTHON" -m popgen show {random_population} {streams}; exit ${{PIPESTATUS[0]}}', tmp_path)

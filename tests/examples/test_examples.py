@@ -25,6 +25,7 @@ def test_every_script_is_here() -> None:
     assert SAYS.keys() == {path.name for path in EXAMPLES.glob("*.py")}
 
 
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("name", SAYS)
 def test_scripts_run_as_their_first_lines_say(name: str, random_population: Path) -> None:
     text = (EXAMPLES / name).read_text()

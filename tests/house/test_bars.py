@@ -19,6 +19,7 @@ def test_the_bar_holds(bar: Bar) -> None:
     assert figure <= bar.most, "\n".join([f"{figure:g}, at most {bar.most:g}", *lines])
 
 
+@pytest.mark.end_to_end
 def test_a_round_of_a_later_member_goes_through_few_files() -> None:
     """`python tests/house/round_files.py` prints them."""
     files = find_round_files()

@@ -92,6 +92,7 @@ def test_the_wheel_holds_every_file_of_the_rooms(wheel: Path, checkout: Path) ->
     assert {name.partition("/")[0] for name in names if not name.startswith("popgen_zsc-")} == {"popgen"}
 
 
+@pytest.mark.end_to_end
 def test_every_group_of_the_configuration_is_found_beside_other_packages(
     project: Path, environment: dict[str, str]
 ) -> None:

@@ -69,6 +69,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     forget_entries()
 
 
+@pytest.mark.end_to_end
 def test_a_toy_method_on_a_toy_environment_from_the_command_line(installed: Path, run: Run) -> None:
     given = ("method=guess", "env=line/short", "scale=quick", "--config-dir", str(installed), "--quiet", "--json")
     folders = []

@@ -115,6 +115,7 @@ def test_agreement_by_hand() -> None:
     assert agreement.within == 2 and agreement.share == pytest.approx(2 / 3)
 
 
+@pytest.mark.end_to_end
 def test_a_population_of_proxies_plays_and_tells_its_source(games: list[HumanGame], tmp_path: Path) -> None:
     fit_population(tmp_path / "p", "cramped_room", "A", seed=4, members=2, training=QUICK, search=SHORT, games=games)
     population = load_population(tmp_path / "p")

@@ -239,6 +239,7 @@ def test_self_sabotage_of_finished_populations(run: Run, tmp_path: Path) -> None
     assert Ledger(tmp_path / "out" / "ledger.jsonl").steps() == 2 * told["steps"]["evaluation"]
 
 
+@pytest.mark.end_to_end
 def test_self_sabotage_trains_every_row_with_equal_options(run: Run, trained: list[RunConfig]) -> None:
     """Each method with the paper's objective and with ours, which has the same bound and the same limit in all, and
     self-play alone as the control."""
@@ -257,6 +258,7 @@ def test_self_sabotage_trains_every_row_with_equal_options(run: Run, trained: li
     assert all(c.xpm_sim.lambda_until == 1.0 for c in trained if c.method == "xpm_sim")  # pressure to the end
 
 
+@pytest.mark.end_to_end
 def test_self_sabotage_trains_what_is_named_under_both_rules(run: Run, trained: list[RunConfig]) -> None:
     methods = [word for name in ("lipo", "comedi", "xpm_sim") for word in ("--method", name)]
     code, out, err = run(

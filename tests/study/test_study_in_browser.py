@@ -22,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from popgen.study.recording_check import check_recordings
 
+pytestmark = pytest.mark.end_to_end
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 KEYS = {"Tab": 9, "Enter": 13, "Space": 32, "ArrowUp": 38, "ArrowDown": 40, "ArrowLeft": 37, "ArrowRight": 39}
 
