@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
 export RAY_USAGE_STATS_ENABLED := 0
 export MLFLOW_DISABLE_TELEMETRY := true
-# Without its cache every process compiles the code and the tests anew: half of the seconds before the first test.
+# Without its cache every process compiles the code and the tests anew: a third of the time before the first test.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: bench chaos clean demo docs format help install lint oracle test test-fast types
