@@ -69,8 +69,15 @@ def report_page(source: ReportSource, *, seed: int = 0) -> str:
         seed=seed,
         provenance=_list_provenance(source),
         differences=_list_differences(source),
-        commands=next_commands(source.folder.name if source.folder else "POPULATION", len(population)),
+        commands=next_commands(_name_place(source), len(population)),
     )
+
+
+def _name_place(source: ReportSource) -> str:
+    """The run as a command takes it; a page that others read tells no folders above that."""
+    if source.folder is None:
+        return "POPULATION"
+    return source.folder.name if source.folder.is_absolute() else str(source.folder)
 
 
 def list_findings(source: ReportSource) -> list[Finding]:

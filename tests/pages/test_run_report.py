@@ -89,6 +89,16 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["show", str(run)]) == 0 and main(["report", str(tmp_path)]) == 2
 
 
+@pytest.mark.parametrize("spelled", ["{}/two", "two", "two/population", "."])
+def test_the_next_commands_take_the_run_as_it_was_given(
+    spelled: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run if spelled == "." else run.parent.parent if "{}" in spelled else run.parent)
+    given = spelled.format(run.parent.name)
+    page = report_page(read_source(given))
+    assert f"<code>popgen play {given.removesuffix('/population')} --watch 1 2</code>" in page
+
+
 @pytest.mark.parametrize(("members", "games"), [(1, 1), (2, 4), (6, 36), (8, 36), (30, 40)])
 def test_replays_are_chosen_by_their_number(members: int, games: int) -> None:
     chosen = choose_games(members)
