@@ -47,6 +47,23 @@ LEAST_SECONDS = 2.0
 """A run promises nothing before."""
 
 
+@dataclass(frozen=True)
+class Part:
+    """Part of a phase: shares of its total at which it begins and ends."""
+
+    first: float = 0.0
+    last: float = 1.0
+
+    def share_after(self, begin: float) -> float:
+        """The share of work that is done in it and goes on evenly from `begin` to the phase's full length."""
+        if begin >= 1.0:
+            return 0.0
+        return (max(begin, self.last) - max(begin, self.first)) / (1.0 - begin)
+
+
+WHOLE = Part()
+
+
 @dataclass
 class Spent:
     """Seconds that work took, and those that it was to cost."""
@@ -62,6 +79,11 @@ class Spent:
     def rate(self, prior: float, weight: float) -> float:
         """Seconds for a cost of 1, `prior` counting as a cost of `weight`."""
         return (self.seconds + weight * prior) / (self.cost + weight)
+
+
+def seconds_alone(work: Work) -> float:
+    """Seconds that work takes where nothing else wants its core: side by side it waits for the others now and then."""
+    return min(work.seconds, work.cpu_seconds) if work.cpu_seconds > 0.0 else work.seconds
 
 
 @dataclass
@@ -93,21 +115,21 @@ class Measured:
     phases: dict[str, SpentByKind] = field(default_factory=dict)
     ends: dict[str, list[float]] = field(default_factory=dict)
 
-    def add(self, phase: PlannedPhase, share: float, seconds: float, work: Mapping[str, Work]) -> None:
-        """So much of a phase took so many seconds; `work` by kind, as far as it is known."""
-        costs = {kind: share * cost for kind, cost in costs_of(phase).items()}
-        known = {kind: work[kind].seconds for kind in costs if kind in work}
+    def add(self, phase: PlannedPhase, part: Part, seconds: float, work: Mapping[str, Work]) -> None:
+        """Part of a phase took so many seconds; `work` by kind, as far as it is known."""
+        costs = costs_of(phase, part)
+        known = {kind: seconds_alone(work[kind]) for kind in costs if kind in work}
         known |= dict.fromkeys(costs, seconds) if len(costs) == 1 else {}
         self.work.add(seconds, join_kinds(phase, costs))
         for kind, spent in known.items():
             self.kinds.setdefault(kind, Spent()).add(spent, costs[kind])
         self.phases.setdefault(phase.name, SpentByKind()).add(seconds, costs)
 
-    def predict_phase(self, phase: PlannedPhase) -> float:
-        """Seconds that its total takes."""
+    def predict_phase(self, phase: PlannedPhase, part: Part) -> float:
+        """Seconds that this part of it takes."""
         past = self.phases.get(phase.name, SpentByKind())
         common = self.work.rate(1.0, PRIOR_SECONDS)
-        costs = costs_of(phase)
+        costs = costs_of(phase, part)
         rates = {kind: self.kinds.get(kind, Spent()).rate(common, KIND_SECONDS) for kind in costs}
         expected = join_kinds(phase, {kind: past.costs.get(kind, 0.0) * rate for kind, rate in rates.items()})
         correction = Spent(past.seconds, expected).rate(1.0, PHASE_SECONDS)
@@ -121,9 +143,10 @@ class Measured:
         return sum(guesses) / len(guesses)
 
 
-def costs_of(phase: PlannedPhase) -> dict[str, float]:
-    """Its cost by kind of work; a phase that names no kinds is one of its own."""
-    return {phase.name: phase.cost} if isinstance(phase.cost, (int, float)) else dict(phase.cost)
+def costs_of(phase: PlannedPhase, part: Part = WHOLE) -> dict[str, float]:
+    """The cost of a part of it by kind of work; a phase that names no kinds is one of its own."""
+    costs = {phase.name: phase.cost} if isinstance(phase.cost, (int, float)) else dict(phase.cost)
+    return {kind: cost * part.share_after(phase.begins.get(kind, 0.0)) for kind, cost in costs.items()}
 
 
 def join_kinds(phase: PlannedPhase, parts: Mapping[str, float]) -> float:
@@ -154,25 +177,29 @@ class RunEstimate:
         if places:
             self._running, self.plan = self.plan[places[0]], self.plan[places[0] + 1 :]
             self._total, self._began, self._work = phase.total or 1.0, self.clock(), {}
-            self._heard, self._end = self._began, None
+            self._heard = self._began
             self._first = self._share = min(1.0, phase.done / self._total)
+            self._end = self._share_at(phase.ends_at)
 
     def update(self, done: float, *, ends_at: float | None = None, work: Mapping[str, Work] | None = None) -> None:
         """So much of the running phase's total is done; `ends_at`: where it will end as things stand; `work`, by kind,
         since it began, where that is known."""
         self._share, self._heard = min(1.0, done / self._total), self.clock()
-        self._end = None if ends_at is None else max(self._share, min(1.0, ends_at / self._total))
+        self._end = self._share_at(ends_at)
         self._work = work or self._work
+
+    def _share_at(self, ends_at: float | None) -> float | None:
+        return None if ends_at is None else max(self._share, min(1.0, ends_at / self._total))
 
     def seconds_left(self) -> float | None:
         """Of the whole run, None as long as nothing was measured."""
         now = self._measure_work()
         if now.work.seconds < LEAST_SECONDS or now.work.cost <= 0.0:
             return None
-        left = sum(now.predict_phase(phase) * now.expect_end(phase) for phase in self.plan)
+        left = sum(now.predict_phase(phase, Part(0.0, now.expect_end(phase))) for phase in self.plan)
         if (running := self._running) is not None:
             end = now.expect_end(running, self._share) if self._end is None else self._end
-            rest = now.predict_phase(running) * (end - self._share)
+            rest = now.predict_phase(running, Part(self._share, end))
             left += max(0.0, rest - (self.clock() - self._heard))
         return left
 
@@ -198,9 +225,9 @@ class RunEstimate:
 
     def _measure_work(self) -> Measured:
         """What was measured, the running phase included."""
-        now, share = deepcopy(self._past), self._share - self._first
-        if self._running is not None and share > 0.0:
-            now.add(self._running, share, self._heard - self._began, self._work)
+        now = deepcopy(self._past)
+        if self._running is not None and self._share > self._first:
+            now.add(self._running, Part(self._first, self._share), self._heard - self._began, self._work)
         return now
 
     def _end_running(self) -> None:
@@ -215,7 +242,7 @@ def _halve_spent(spent: Mapping[str, float]) -> Spent:
     return Spent(float(spent["seconds"]) / 2.0, float(spent["cost"]) / 2.0)
 
 
-EVALUATION, REPORT_SECONDS, EVALUATED_SECONDS = "evaluation", 8.0, 4e-5
+EVALUATION, REPORT_SECONDS, EVALUATED_SECONDS = "evaluation", 4.0, 4e-5
 """Its name, and what takes how long on a laptop's core: figures and pages, and each environment step."""
 
 

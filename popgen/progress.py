@@ -33,7 +33,7 @@ BAR_WIDTH, NARROW_BAR, WIDE = 10, 5, 100
 """Columns of the bar, on terminals of at least `WIDE` columns and on others."""
 FIXED_WIDTH = 4 + 7 + 7 + 7
 """Columns of a progress line beside its name, bar and figures: share, time passed, time left, gaps."""
-WHOLE_WIDTH = len("all 59 min")
+WHOLE_WIDTH = len("all 9.5 min")
 
 
 class Reporter(Protocol):
@@ -300,10 +300,12 @@ def fit_texts(texts: Sequence[str], width: int) -> str:
 
 
 def whole_text(seconds: float) -> str:
-    """A rough time: 40 s, 9 min, 2.5 h."""
+    """A rough time, to a fifth or closer: 40 s, 2.5 min, 14 min, 2.5 h."""
     seconds = max(seconds, 0.0)
-    if seconds < 60:
+    if seconds <= 90:
         return f"{math.ceil(seconds / 10) * 10} s"
+    if seconds < 585:
+        return f"{round(seconds / 30) / 2:g} min"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 

@@ -169,7 +169,10 @@ def test_a_silent_phase_gets_a_line_every_few_seconds() -> None:
     assert stream.getvalue().splitlines() == ["starting Ray  5s passed", "starting Ray  10s passed"]
 
 
-@pytest.mark.parametrize(("seconds", "text"), [(-3, "0 s"), (31, "40 s"), (540, "9 min"), (9000, "2.5 h")])
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(-3, "0 s"), (31, "40 s"), (90, "90 s"), (100, "1.5 min"), (540, "9 min"), (590, "10 min"), (9000, "2.5 h")],
+)
 def test_whole_text(seconds: float, text: str) -> None:
     assert whole_text(seconds) == text
 

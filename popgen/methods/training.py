@@ -144,6 +144,7 @@ class Phase:
         member: whom it trains.
         last: the last of those it trains together; 0 where that is `member`.
         done: of the total, before it begins: a phase may go on where an earlier attempt was.
+        ends_at: of the total, as in `Progress`.
     """
 
     name: str
@@ -151,6 +152,7 @@ class Phase:
     member: int
     last: int = 0
     done: float = 0.0
+    ends_at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ class PlannedPhase:
             work where it has several, or one that other phases have too (the kinds of `Round.work`).
         earliest: share of the total at which it may be over, where a target can end it.
         side_by_side: its kinds of work go on at the same time, so that the longest one counts.
+        begins: shares of the total at which kinds of work begin, where that is not the first.
     """
 
     name: str
@@ -171,6 +174,7 @@ class PlannedPhase:
     last: int = 0
     earliest: float = 1.0
     side_by_side: bool = False
+    begins: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,9 @@ def plan_phases(config: WorldModelRun, spec: EnvSpec) -> list[PlannedPhase]:
         cost = {"model": (most - 1) * two.model_updates * model_update, "agent": updates * together}
         earliest = phase2.count_imagination(two, min(two.rounds, most)) / updates
         beside = overlaps and two.model_lag > 0
-        phases.append(PlannedPhase(phase2.IMAGINATION, member, cost, earliest=earliest, side_by_side=beside))
+        begins = {"model": phase2.count_imagination(two, 1) / updates}  # it learns in each round after the first
+        planned = PlannedPhase(phase2.IMAGINATION, member, cost, 0, earliest, beside, begins)
+        phases.append(planned)
     return phases
 
 

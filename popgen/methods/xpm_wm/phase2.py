@@ -150,7 +150,7 @@ def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name:
 def describe_imagination(progress: LaterMemberProgress, phase: Phase2Config, member: int, most: int) -> Phase:
     """The phase of a later member: updates of at most so many rounds, those of the rounds so far done."""
     total, done = (count_imagination(phase, rounds) for rounds in (most, progress.rounds))
-    return Phase(IMAGINATION, total, member, done=done)
+    return Phase(IMAGINATION, total, member, done=done, ends_at=foresee_end(progress, phase, most))
 
 
 def describe_updates(

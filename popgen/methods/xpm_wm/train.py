@@ -247,4 +247,6 @@ class LaterMember:
         trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
         ended = phase2.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)
         goes_on, keeps = phase2.plays_on(progress, self.phase, self.most_rounds), progress.skills is not None
+        plan = phase2.describe_imagination(progress, self.phase, self.member, self.most_rounds)
+        ended = replace(ended, done=plan.done, ends_at=plan.ends_at)
         return replace(ended, sampled=tuple(sampled), at_rest=goes_on or keeps, must_save=keeps and not goes_on)
