@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -165,7 +166,8 @@ class GameRecords:
             connection.execute(participants.update().where(participants.c.id.in_(playing)).values(**seen))
 
     def _end_game(self, connection: Connection, end: GameEnd) -> None:
-        values = {"status": end.status, "score": end.score}
+        steps = connection.execute(sa.select(ticks).where(ticks.c.game == end.game).order_by(ticks.c.step)).all()
+        values = {"status": end.status, "score": end.score, "digest": digest_steps(steps)}
         still = (games.c.id == end.game) & (games.c.status == OPEN)
         if connection.execute(games.update().where(still).values(**values)).rowcount == 0:
             return
@@ -176,6 +178,11 @@ class GameRecords:
         connection.execute(participants.update().where(own).values(voids=participants.c.voids + 1))
         if (connection.scalar(sa.select(participants.c.voids).where(own)) or 0) >= self.definition.voids:
             self.people.end(connection, end.participant, INACTIVE)
+
+
+def digest_steps(steps: Sequence[sa.Row]) -> str:
+    """Of rows of `ticks`, every column: an action that changed nothing in the game is told by it alone."""
+    return hashlib.sha256(repr([tuple(step) for step in steps]).encode()).hexdigest()
 
 
 def read_ticket(connection: Connection, row: Any) -> GameTicket:

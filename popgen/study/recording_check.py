@@ -1,4 +1,8 @@
-"""Proof of recordings: every game is played again, the person's actions as recorded and the ego's anew."""
+"""Proof of recordings: every game is played again, the person's actions as recorded and the ego's anew.
+
+An action of the person that changed nothing (interact before nothing) follows from no state: what was written of a
+game that is over is compared with the digest that was taken at its end.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from popgen.study.game_records import FINISHED, VOID
+from popgen.study.game_records import FINISHED, VOID, digest_steps
 from popgen.study.hosted_game import HostedGame, PartnerShelf, open_shelves
 from popgen.study.study_definition import Study
 from popgen.study.study_tables import Database, games, ticks
@@ -71,6 +75,8 @@ def _find_problem(row: sa.Row, steps: Sequence[sa.Row], shelf: PartnerShelf) -> 
             return f"the score is {game.score:g}, recorded is {row.score:g}"
         if row.status == FINISHED and len(steps) != row.steps:
             return f"{len(steps)} steps are recorded of a game of {row.steps}"
+        if row.status in (FINISHED, VOID) and digest_steps(steps) != row.digest:
+            return "a step was changed after the end of the game"
         return None
     finally:
         shelf.give_back(policy)

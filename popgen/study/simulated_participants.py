@@ -13,13 +13,14 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.cookiejar import CookieJar
 from typing import Any
 
 import numpy as np
 from websockets.asyncio.client import connect
-from websockets.exceptions import WebSocketException
+from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.errors import UserError
@@ -52,8 +53,8 @@ class Casting:
     """
 
     def __init__(self, study: Study, populations: Sequence[Population]) -> None:
-        shelves = open_shelves(study)
-        self._envs: dict[str, OvercookedEnv] = {layout: shelf.env for (layout, _), shelf in shelves.items()}
+        self._shelves = open_shelves(study)
+        self._envs: dict[str, OvercookedEnv] = {layout: shelf.env for (layout, _), shelf in self._shelves.items()}
         self._members: dict[str, list[tuple[Population, int]]] = {}
         for population in populations:
             layout = find_layout(population)
@@ -63,6 +64,14 @@ class Casting:
                 raise UserError(str(population.path), f"plays {layout}, which is not this study's", fix)
             found = self._members.setdefault(layout, [])
             found += [(population, member) for member in range(1, len(population) + 1)]
+
+    def warm_up(self) -> None:
+        """Play a step with each member: what is compiled or read at the first use would make others' steps late."""
+        for (layout, _), shelf in self._shelves.items():
+            game, policy = HostedGame(shelf.env, shelf.take(), 0, 0), self.draw(layout, np.random.default_rng(0))
+            game.advance(0)
+            policy.reset(1, 0)
+            policy.act(game.env.encode(game.state[None], policy.view), np.zeros((1, 2), np.uint8), np.array([True]))
 
     def env(self, layout: str) -> OvercookedEnv:
         """The layout's environment, to be asked only."""
@@ -190,7 +199,7 @@ class SimulatedParticipant:
         self._note_break(facts["number"], step)
         if facts.get("host") == "browser":
             await self._play_here(line, facts)
-            self.visit.games += 1
+            self._end_game(facts["number"])
             return
         env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
         policy.reset(1, int(self._rng.integers(2**31)))
@@ -204,16 +213,24 @@ class SimulatedParticipant:
                 obs = env.encode(np.array(told["state"], np.uint8)[None], policy.view)
                 previous = np.array(policy.act(obs, previous, np.array([first])), np.uint8)
                 first = False
-                await line.send(json.dumps(press_key(codes.get(int(previous[0, facts["seat"]])), told["step"])))
+                pressed = press_key(codes.get(int(previous[0, facts["seat"]])), told["step"])
+                with suppress(ConnectionClosed):  # where the game is over, what was told before is still to be heard
+                    await line.send(json.dumps(pressed))
             told = json.loads(await line.recv())
             self.visit.steps += "state" in told
+        self._end_game(facts["number"])
+
+    def _end_game(self, number: int) -> None:
+        """A void game begins anew under its number: nothing of it is lost by that."""
         self.visit.games += 1
+        self.visit.shown.pop(number, None)
 
     async def _play_here(self, line: Any, facts: Mapping[str, Any]) -> None:
         """A game whose rules and partner run on this side, as in a browser; in real time where the study has any."""
-        env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
-        program = read_program(await asyncio.to_thread(self._fetch_file, "partner"))
-        game = HostedGame(env, ProgramRunner(program, env.spec.num_actions), facts["seat"], facts["seed"])
+        env, policy = self._casting.env(facts["layout"]), await asyncio.to_thread(self._load_policy, facts["layout"])
+        held = await asyncio.to_thread(self._fetch_file, "partner")
+        partner = await asyncio.to_thread(lambda: ProgramRunner(read_program(held), env.spec.num_actions))
+        game = HostedGame(env, partner, facts["seat"], facts["seed"])
         if game.repeat(np.array(facts["actions"], np.uint8).reshape(-1, 2)) is not None:
             raise UserError(self._address, "sent a game that its partner does not play so", "report it")
         policy.reset(1, int(self._rng.integers(2**31)))

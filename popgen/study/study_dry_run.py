@@ -155,6 +155,7 @@ def run_dry(study: Study, casting: Casting, plan: DryRunPlan, told: Callable[[in
     Raises:
         UserError: the server does not start or does not answer.
     """
+    casting.warm_up()
     server = ServerProcess(study, plan.speed)
     server.start()
     database = Database(study.database, study)

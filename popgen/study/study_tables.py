@@ -20,7 +20,7 @@ from sqlalchemy.exc import DatabaseError
 from popgen.errors import UserError
 from popgen.study.study_definition import Study
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"
 
 metadata = sa.MetaData()
 
@@ -69,6 +69,7 @@ games = sa.Table(
     sa.Column("step_ms", sa.Integer, nullable=False),
     sa.Column("status", sa.Text, nullable=False),  # open, finished or void
     sa.Column("score", sa.Float),
+    sa.Column("digest", sa.Text),  # sha256 of all its steps, once it is over
     sa.Column("began_ms", sa.Integer, nullable=False),
     sa.UniqueConstraint("participant", "number", "attempt"),
 )

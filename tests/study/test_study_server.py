@@ -75,26 +75,34 @@ def test_from_consent_to_code(server: tuple[StudyService, str], study: Study) ->
     assert again.post("session", {"recruit": RECRUIT})[0] == 409  # once only
 
 
-def test_every_game_is_proven_and_a_flipped_action_found(server: tuple[StudyService, str], study: Study) -> None:
+@pytest.mark.parametrize("whose", ["person", "ego"])
+def test_every_game_is_proven_and_a_flipped_action_found(
+    whose: str, server: tuple[StudyService, str], study: Study
+) -> None:
+    """Also one that changes nothing: whoever stands before a wall may stay or walk against it."""
     service, address = server
     browser = Browser(address)
     browser.pass_check()
     browser.go_on()
     checked = check_recordings(study, service.people.database)
     assert len(checked) >= 5 and not [one for one in checked if one.problem]
-    tampered = Database(study.folder / "tampered.sqlite", study)
-    with service.people.database.read() as source, tampered.write() as target:
-        for table in (participants, games, ticks):
-            target.execute(table.insert(), [row._asdict() for row in source.execute(sa.select(table))])
-        target.exec_driver_sql("DROP TRIGGER ticks_are_final")
-        game = target.execute(sa.select(games).where(games.c.ego.is_not(None))).first()
-        assert game is not None
-        column = (ticks.c.action_0, ticks.c.action_1)[1 - game.seat]  # the ego's
-        target.execute(
-            ticks.update().where((ticks.c.game == game.id) & (ticks.c.step == 7)).values({column: (column + 1) % 6})
-        )
-    wrong = [one for one in check_recordings(study, tampered) if one.problem]
-    assert [one.game for one in wrong] == [game.id] and str(wrong[0].problem).startswith("step 7")
+    copies = [(table, [row._asdict() for row in rows(service, table)]) for table in (participants, games, ticks)]
+    for step in range(STEPS):
+        tampered = Database(study.folder / f"tampered-{whose}-{step}.sqlite", study)
+        with tampered.write() as target:
+            for table, copied in copies:
+                target.execute(table.insert(), copied)
+            target.exec_driver_sql("DROP TRIGGER ticks_are_final")
+            game = target.execute(sa.select(games).where(games.c.ego.is_not(None))).first()
+            assert game is not None
+            seat = game.seat if whose == "person" else 1 - game.seat
+            column = (ticks.c.action_0, ticks.c.action_1)[seat]
+            here = (ticks.c.game == game.id) & (ticks.c.step == step)
+            target.execute(ticks.update().where(here).values({column: (column + 1) % 6}))
+        wrong = [one for one in check_recordings(study, tampered) if one.problem]
+        assert [one.game for one in wrong] == [game.id], step
+        if whose == "ego":
+            assert str(wrong[0].problem).startswith(f"step {step}: ")
 
 
 def test_recorded_steps_cannot_be_changed(server: tuple[StudyService, str]) -> None:
