@@ -103,7 +103,7 @@ class Visit:
     steps: int = 0
     breaks: int = 0
     lost: int = 0
-    shown: dict[int, int] = field(default_factory=dict)
+    shown: dict[tuple[int, int | None], int] = field(default_factory=dict)
 
 
 class SimulatedParticipant:
@@ -196,10 +196,10 @@ class SimulatedParticipant:
     async def _play_on(self, line: Any) -> None:
         begun = json.loads(await line.recv())
         facts, step = begun["begin"], begun["step"]
-        self._note_break(facts["number"], step)
+        self._note_break(name_game(facts), step)
         if facts.get("host") == "browser":
             await self._play_here(line, facts)
-            self._end_game(facts["number"])
+            self._end_game(name_game(facts))
             return
         env, policy = self._casting.env(facts["layout"]), self._load_policy(facts["layout"])
         policy.reset(1, int(self._rng.integers(2**31)))
@@ -209,7 +209,7 @@ class SimulatedParticipant:
         await line.send(json.dumps({"go": True}))
         while "over" not in told:
             if "state" in told:
-                self.visit.shown[facts["number"]] = told["step"]
+                self.visit.shown[name_game(facts)] = told["step"]
                 obs = env.encode(np.array(told["state"], np.uint8)[None], policy.view)
                 previous = np.array(policy.act(obs, previous, np.array([first])), np.uint8)
                 first = False
@@ -218,12 +218,12 @@ class SimulatedParticipant:
                     await line.send(json.dumps(pressed))
             told = json.loads(await line.recv())
             self.visit.steps += "state" in told
-        self._end_game(facts["number"])
+        self._end_game(name_game(facts))
 
-    def _end_game(self, number: int) -> None:
+    def _end_game(self, name: tuple[int, int | None]) -> None:
         """A void game begins anew under its number: nothing of it is lost by that."""
         self.visit.games += 1
-        self.visit.shown.pop(number, None)
+        self.visit.shown.pop(name, None)
 
     async def _play_here(self, line: Any, facts: Mapping[str, Any]) -> None:
         """A game whose rules and partner run on this side, as in a browser; in real time where the study has any."""
@@ -242,9 +242,9 @@ class SimulatedParticipant:
             self._policies[layout] = self._casting.draw(layout, self._rng)
         return self._policies[layout]
 
-    def _note_break(self, number: int, step: int) -> None:
+    def _note_break(self, name: tuple[int, int | None], step: int) -> None:
         """Steps that were shown before and are not recorded."""
-        shown = self.visit.shown.get(number, 0) if step else self.visit.shown.pop(number, 0)
+        shown = self.visit.shown.get(name, 0) if step else self.visit.shown.pop(name, 0)
         self.visit.lost = max(self.visit.lost, shown - step)
 
 
@@ -299,7 +299,7 @@ class PlayedHere:
         row = [game.step - 1, played.state.tobytes().hex(), *played.actions, since, int(late * 1e6), keys]
         self._batch.append(row)
         self._visit.steps += 1
-        self._visit.shown[self._facts["number"]] = game.step
+        self._visit.shown[name_game(self._facts)] = game.step
 
     async def _send_batch(self) -> None:
         if self._batch:
@@ -310,6 +310,11 @@ class PlayedHere:
         told = json.loads(await self._line.recv())
         self._kept = told.get("kept", self._kept)
         self._over = self._over or "over" in told
+
+
+def name_game(facts: Mapping[str, Any]) -> tuple[int, int | None]:
+    """What tells a game from the void one whose number it has: in the browser the seed of its partner."""
+    return facts["number"], facts.get("seed")
 
 
 def press_key(code: str | None, step: int) -> dict[str, Any]:
