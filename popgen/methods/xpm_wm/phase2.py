@@ -7,7 +7,7 @@ Rules and what is said of a round are functions of the progress and the recipe; 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -168,12 +168,13 @@ def foresee_end(progress: LaterMemberProgress, phase: Phase2Config, most: int) -
 
 
 def describe_later_round(
-    progress: LaterMemberProgress, member: int, scored: Candidate, score_name: str, trouble: str
+    progress: LaterMemberProgress, plan: Phase, scored: Candidate, score_name: str, trouble: str
 ) -> Round:
-    """The round that has ended, with its figures, and its line with signs of trouble."""
-    note = f"member {member}, {describe_round(progress, scored, score_name)}"
+    """The round that has ended, with its figures, and its line with signs of trouble; `plan` is the phase by now."""
+    note = f"member {plan.member}, {describe_round(progress, scored, score_name)}"
     note += f"; {trouble}" if trouble else ""
-    return Round(member, progress.steps, progress.figures, note=note, number=progress.rounds)
+    ended = Round(plan.member, progress.steps, progress.figures, note=note, number=progress.rounds)
+    return replace(ended, done=plan.done, ends_at=plan.ends_at)
 
 
 @dataclass(frozen=True)

@@ -230,8 +230,7 @@ class LaterMember:
                 return update.weights
 
     def collect_real_episodes(self, published: MemberWeights) -> list[Sampled]:
-        """Lines 17, 19 and 20: one episode in each environment; partners act with their own archived filters, and every
-        pair is met in an order drawn for the round."""
+        """Lines 17, 19, 20: one episode in each environment, pairs in a drawn order; partners have their filters."""
         seed = self.seed * 100 + self.progress.rounds + 1
         matches = real.later_matches(self.member, self.pairs, self.phase.episodes_sp, self.episodes_xp, seed)
         policies = real.policy_snapshots(self.config, {**self.archive, self.member: published.acting})
@@ -245,8 +244,7 @@ class LaterMember:
         scored = phase2.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
         progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
         trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
-        ended = phase2.describe_later_round(progress, self.member, scored, self.spec.score_name, trouble)
-        goes_on, keeps = phase2.plays_on(progress, self.phase, self.most_rounds), progress.skills is not None
         plan = phase2.describe_imagination(progress, self.phase, self.member, self.most_rounds)
-        ended = replace(ended, done=plan.done, ends_at=plan.ends_at)
+        ended = phase2.describe_later_round(progress, plan, scored, self.spec.score_name, trouble)
+        goes_on, keeps = phase2.plays_on(progress, self.phase, self.most_rounds), progress.skills is not None
         return replace(ended, sampled=tuple(sampled), at_rest=goes_on or keeps, must_save=keeps and not goes_on)
