@@ -117,12 +117,12 @@ class BrowserGameHost:
                 self._writer.tell(lambda: one.tell(kept))
 
     def _take_step(self, one: _OpenGame, told: UploadedStep, latency: float | None) -> None:
-        """Record a step, and end the game with the last one."""
+        """Record a step, and end the game with the last one or a wrong one, once those before are recorded."""
         tick = one.replay_step(told, latency)
         if tick is None:
             _log.error("game %d: step %d is not what the rules and the ego give", one.ticket.id, told.step)
             one.over = True
-            one.tell({"over": "failed"})
+            self._writer.tell(lambda: one.tell({"over": "failed"}))
             return
         self._writer.put(tick)
         if one.game.step >= one.ticket.steps:

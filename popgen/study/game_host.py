@@ -238,7 +238,7 @@ class ServerGameHost:
         except Exception:  # one game's failure must not end the others'
             _log.exception("game %d failed at step %d", one.ticket.id, one.game.step)
             one.running = False
-            one.tell({"over": "failed"})
+            self._writer.tell(lambda: one.tell({"over": "failed"}))  # a reload goes on after what is recorded
             return
         tick = Tick(
             game=one.ticket.id,
