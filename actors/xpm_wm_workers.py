@@ -28,6 +28,7 @@ from popgen.methods.training import (
     Transport,
     Worker,
 )
+from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.agent import AgentLearner
 from popgen.methods.xpm_wm.config import FcpWmRun, WorldModelRun
 from popgen.methods.xpm_wm.imagination import OLD
@@ -36,15 +37,17 @@ from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.real_play import MemberWeights, Tally, TallyKeeper
 from popgen.methods.xpm_wm.replay import Draws, Query, Replay, Request, Windows, draw, join, model_batch, start_batch
 from popgen.methods.xpm_wm.skilled_training import FcpWmTraining
-from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelTask, ModelUpdate
-from popgen.methods.xpm_wm.world_model import ModelLearner, Starts
-from popgen.nets.weights import Weights, prefixed, under, weights_of
+from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, FittedPartners, ModelTask, ModelUpdate
+from popgen.methods.xpm_wm.world_model import ModelLearner, Starts, fit_partners
+from popgen.nets.weights import Weights, load_weights, prefixed, under, weights_of
 from popgen.play.rollout import Match
 from popgen.types import Kind, Segment
 
 BUFFERS = ("replay_sp", "replay_xp")
 CHUNK = 25
 """Updates whose batches are drawn in one call."""
+FIT_WINDOWS = 256
+"""Windows of kept data to which partners are fitted, beside as many of the member's own."""
 
 
 class ReplayActor:
@@ -121,6 +124,7 @@ class WorldModelActor:
         self.spec = build_env(config.env, 1).spec
         self.learner = ModelLearner(config.world_model, self.spec, seed, device_of(config.cluster.model_gpus))
         self.member = 1
+        self.partners: dict[int, Weights] = {}
         self.biased = False
 
     def begin_member(self, member: int, archive: dict[int, Weights]) -> None:
@@ -130,6 +134,7 @@ class WorldModelActor:
             self.learner.set_learning_rate(self.config.phase2.model_lr)
         for predecessor in sorted(set(archive) - set(self.learner.predecessors)):
             self.learner.add_predecessor(predecessor, under("filter", archive[predecessor]))
+        self.partners = {one: under("actor", weights) for one, weights in archive.items()}
 
     def _draw_windows(self, draws: Draws, length: int, repeats: int) -> list[list[Windows | None]]:
         view = self.config.world_model.view
@@ -197,6 +202,22 @@ class WorldModelActor:
                 starts.append(self.learner.starts(seen, part, count, pool=request.pool, skip=length - per_window))
         return Starts.concat(starts)
 
+    def fit_partners(self) -> FittedPartners:
+        """The actors of those before on the present model's latents of the states that imagination starts from."""
+        config, steps = self.config, self.config.phase2.partner_fits
+        if not steps or not self.partners:
+            return FittedPartners({}, {})
+        draws = start_batch(config, self.spec, self.member, FIT_WINDOWS)
+        parts = self._draw_windows(draws, config.world_model.length, 1)[0]
+        windows = join([part for part in parts if part is not None])
+        actors: dict[int, Actor] = {}
+        for member, weights in sorted(self.partners.items()):
+            actors[member] = Actor(config.agent, config.world_model, self.spec.num_actions)
+            load_weights(actors[member], weights)
+        before, after = np.mean(fit_partners(self.learner, actors, windows, steps), axis=0)
+        figures = {"partner_drift": float(before), "partner_drift_left": float(after)}
+        return FittedPartners({member: weights_of(actor) for member, actor in actors.items()}, figures)
+
     def report(self) -> dict[str, float]:
         """Event precision and recall at one step and open loop, exact observations: on fresh windows."""
         length = self.config.world_model.length
@@ -230,7 +251,8 @@ class AgentActor:
 
     def _fresh_learner(self, member: int, seed: int) -> AgentLearner:
         config, device = self.config, device_of(self.config.cluster.agent_gpus)
-        return AgentLearner(config.agent, config.world_model, self.spec, member, seed, device, config.discovery)
+        agent = config.agent_of(member)
+        return AgentLearner(agent, config.world_model, self.spec, member, seed, device, config.discovery)
 
     def begin_member(self, member: int, seed: int, partners: dict[int, Weights]) -> None:
         """A fresh actor and critics beside frozen predecessors (acting weights by member)."""
@@ -245,15 +267,15 @@ class AgentActor:
     def train(self, task: AgentTask) -> AgentUpdate:
         """Imagine and update; what comes of it stays in the store."""
         began, began_cpu = time.perf_counter(), time.process_time()
-        model = task.model.result()
-        self.learner.set_model(model)
+        model, fitted = task.model.result(), task.partners.result() if task.partners is not None else None
+        self.learner.set_model(model, None if fitted is None else fitted.actors)
         self.learner.set_starts(task.starts.result(), task.new_share)
         self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
         self.learner.constraint.multipliers = dict(task.multipliers)
-        rates: dict[str, float] = {}
+        rates: dict[str, float] = {} if fitted is None else dict(fitted.figures)
         if task.tally is not None:
             recent = None if task.recent is None else task.recent.result()
-            rates = self.learner.compare_with_real_play(task.tally, recent)
+            rates |= self.learner.compare_with_real_play(task.tally, recent)
         totals: dict[str, list[float]] = defaultdict(list)
         for _ in range(task.updates):
             for name, value in self.learner.update().items():
@@ -380,6 +402,10 @@ class XpmWmWorkers:
     def cache_starts(self) -> Pending[Starts]:
         """The world-model learner's."""
         return self.model.ask(WorldModelActor.cache_starts)
+
+    def fit_partners(self) -> Pending[FittedPartners]:
+        """The world-model learner's."""
+        return self.model.ask(WorldModelActor.fit_partners)
 
     def model_weights(self) -> Pending[Weights]:
         """The world-model learner's."""

@@ -96,6 +96,16 @@ def test_the_paper_preset_has_nothing_of_the_laptops_recipe() -> None:
     assert later.first_updates == later.updates_per_round == later.model_updates == intervals * first.agent_updates
 
 
+@pytest.mark.parametrize("name", ["entropy", "discount"])
+def test_a_later_member_has_member_1s_settings_unless_it_has_its_own(name: str) -> None:
+    null = [f"phase2.{other}=null" for other in ("entropy", "discount") if other != name]
+    config = parsed(f"agent.{name}=0.05", f"phase2.{name}=0.01", *null)
+    assert [getattr(config.agent_of(member), name) for member in (1, 2, 8)] == [0.05, 0.01, 0.01]
+    assert config.agent_of(8).model_copy(update={name: 0.05}) == config.agent
+    same = parsed(f"agent.{name}=0.05", f"phase2.{name}=null", *null)
+    assert same.agent_of(2) == same.agent
+
+
 def test_overrides_win_over_the_papers_table() -> None:
     config = parsed("scale=paper", "agent.lambda_xp=0.5", "phase1.max_steps=1000")
     assert (config.agent.lambda_xp, config.phase1.max_steps) == (0.5, 1000)

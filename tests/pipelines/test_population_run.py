@@ -91,7 +91,7 @@ def smoke(root: Path, name: str, *overrides: str) -> RunConfig:
     learners side by side in both phases."""
     base = ["scale=smoke", "tracking=off", "population.size=2", f"env.params.horizon={HORIZON}", "seed=3"]
     base += ["phase2.rounds=2", f"run.root={root}", f"run.id={name}", "agent.advantage_clip=5", "phase1.plateau=2"]
-    base += ["phase2.model_lag=1"]
+    base += ["phase2.model_lag=1", "phase2.partner_fits=2"]
     base += [f"discovery.{option}" for option in ("count_bonus=1", "trust=2", "rare_events=9", "found_events=1")]
     return RunConfig.parse(compose([*base, *overrides]))
 
@@ -411,7 +411,7 @@ def test_the_agent_imagines_before_or_beside_the_world_models_update(root: Path,
     def answer(name: str, result: Any) -> Callable[..., Ready[Any]]:
         return lambda *_: (asked.append(name), Ready(result))[1]
 
-    names = {name: answer(name, None) for name in ("cache_starts", "model_weights")}
+    names = {name: answer(name, None) for name in ("cache_starts", "model_weights", "fit_partners")}
     model = ModelUpdate(Ready({}), None, {"loss": 1.0})
     learned = AgentUpdate(MemberWeights(Ready({}), Ready({}), Ready({})), {"entropy": 0.5})
     later.work = SimpleNamespace(
@@ -420,10 +420,10 @@ def test_the_agent_imagines_before_or_beside_the_world_models_update(root: Path,
         update_agent=answer("update_agent", learned),
     )
     loop, figures = later.train(), []
-    while len(asked) < 4 or len(figures) < 2:
+    while len(asked) < 5 or len(figures) < 2:
         record = next(loop)
         figures += [name for name in getattr(record, "figures", {}) if name in ("model/loss", "agent/entropy")]
-    states, update, imagine = ["cache_starts", "model_weights"], ["update_world_model"], ["update_agent"]
+    states, update, imagine = [*names], ["update_world_model"], ["update_agent"]
     assert asked == ([*states, *update, *imagine] if lag else [*update, *states, *imagine])
     assert figures == ["agent/entropy", "model/loss"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -84,6 +84,47 @@ class Actor(nn.Module):
         own = writer.add_operation("times", (z, writer.add_linear("seat", self.masks.T)))
         inputs = writer.add_operation("join", ([h] if self.use_h else []) + [own, "seat"])
         return writer.finish(writer.add_layers(self.net, inputs), unimix=self.config.unimix)
+
+
+class Fit(NamedTuple):
+    """What `fit_actor` did: KL in nats from the wanted policy to the actor's, before and after, over the states."""
+
+    before: float
+    after: float
+
+
+def fit_actor(
+    actor: Actor,
+    latent: Latent,
+    wanted: Float[Tensor, "R P A"],
+    steps: int,
+    rng: np.random.Generator,
+    *,
+    rows: int = 512,
+    rate: float = 1e-3,
+) -> Fit:
+    """Train `actor` until it acts in the states (R, .) as `wanted`, log-probabilities by seat, says.
+
+    Args:
+        steps: of Adam, each on `rows` random states in both seats.
+        rate: Adam's step size.
+    """
+    both = torch.arange(wanted.shape[1], device=wanted.device)
+
+    def divergence(part: Latent, target: Tensor) -> Tensor:
+        log_probs = actor.log_probs(part.expand_players(), both.expand(target.shape[:2]))
+        return (target.exp() * (target - log_probs)).sum(-1).mean()
+
+    with torch.no_grad():
+        before = float(divergence(latent, wanted))
+    optimiser = torch.optim.Adam(actor.parameters(), lr=rate, fused=True)
+    for _ in range(steps):
+        picked = torch.from_numpy(rng.integers(0, len(wanted), size=rows)).to(wanted.device)
+        optimiser.zero_grad(set_to_none=True)
+        divergence(latent[picked], wanted[picked]).backward()
+        optimiser.step()
+    with torch.no_grad():
+        return Fit(before, float(divergence(latent, wanted)))
 
 
 class TwoHot(nn.Module):

@@ -267,9 +267,8 @@ def step_networks(networks: AgentNetworks, parts: Sequence[Samples]) -> dict[str
 class AgentLearner:
     """Actor, one self-play critic and one cross-play critic per partner of member `member`.
 
-    Set the world model, start states and partners, then call `update`; set `plays` as soon as real self-play has
-    started. All tensors are on `device`; weights come and go as arrays. What the generators give differs between kinds
-    of devices, initial weights do not.
+    Set the world model, start states and partners, then call `update`; set `plays` once real self-play has started.
+    Tensors are on `device`, weights come and go as arrays. Generators differ between devices, initial weights do not.
     """
 
     def __init__(
@@ -325,9 +324,11 @@ class AgentLearner:
         self.partners[member] = actor.to(self.device, self.dtype).eval().requires_grad_(False)
         self.networks.add_critic(member)
 
-    def set_model(self, weights: w.Weights) -> None:
-        """The world model to imagine with, in the rollout's precision."""
+    def set_model(self, weights: w.Weights, partners: Mapping[int, w.Weights] | None = None) -> None:
+        """The world model to imagine with, in the rollout's precision, and partners' actors that were fitted to it."""
         w.load_weights(self.model, weights, cast=True)
+        for member, actor in (partners or {}).items():
+            w.load_weights(self.partners[member], actor, cast=True)
 
     def set_starts(self, starts: Starts, new_share: float) -> None:
         """States to start from; `new_share` of the draws come from this member's own data."""

@@ -292,6 +292,9 @@ class Phase2Config(Schema):
     """Updates of actor and critics before each further round of real episodes."""
     model_updates: NonNegative = 300
     """World-model updates in each round after the first."""
+    partner_fits: NonNegative = 0
+    """Gradient steps by which each partner's actor is fitted anew, before imagination, to act on the present world
+    model's latents as it does on its own; 0: it acts on them as it is."""
     model_lag: Annotated[_Int, Field(ge=0, le=1)] = 0
     """1: the world model learns beside the agent, which imagines with that of the round before; 0: before the agent
     does. Where imagination starts from is up to date in both."""
@@ -306,6 +309,11 @@ class Phase2Config(Schema):
     """Rounds of real episodes of each member."""
     max_rounds: Positive = 9
     """Rounds of a member whose best self-play score stays below `target_score`."""
+    entropy: Weight | None = None
+    """Weight of a later member's entropy at the start; null: `agent.entropy`."""
+    discount: Fraction | None = None
+    """Discount of a later member's rewards per step; null: `agent.discount`. Its critics know real play of its own for
+    fewer steps: the longer they look ahead, the more they overrate what imagination drifts to."""
     target_score: Number = 8.0
     """Self-play score below which a member gets further rounds, up to `max_rounds`."""
     max_steps: Positive | None = None
@@ -411,6 +419,12 @@ class WorldModelRun(RunConfig):
             problem = f"is 0, but agent.lambda_xp={self.agent.lambda_xp:g} needs to know the strongest partner"
             raise UserError("phase2.episodes_xp", problem, "raise it, or set agent.lambda_xp=0")
         return self
+
+    def agent_of(self, member: int) -> AgentConfig:
+        """How the member's actor and critics learn."""
+        own = {"entropy": self.phase2.entropy, "discount": self.phase2.discount}
+        changes = {name: value for name, value in own.items() if value is not None}
+        return self.agent if member == 1 else self.agent.model_copy(update=changes)
 
     @property
     def heeds_predecessors(self) -> bool:

@@ -21,6 +21,12 @@ LAPTOP = Recipe(
         "phase1.plateau": because(10, "member 1 learns until it gains no more; self-play is what populations are for"),
         "phase1.model_updates": because(40, "the model learns more from the few soups that there are"),
         "agent.entropy": because(0.04, _CHANCE),
+        "phase2.entropy": because(
+            0.02, "the model has seen soups by then (docs/notes/learning.md, What holds later members back)"
+        ),
+        "phase2.partner_fits": because(
+            100, "partners are themselves on the latents (docs/notes/learning.md, the same)"
+        ),
         "phase2.max_rounds": because(16, "a member that is still weak after eight rounds gets some more"),
         "phase2.plateau": because(2, "so does one that still improves"),
         "phase2.model_lag": because(1, "the second core works (docs/notes/learning.md, A model that lags)"),
@@ -31,6 +37,13 @@ LAPTOP = Recipe(
             "phase1.max_steps": 680_000,
             "phase1.target_score": 10.5,
             "phase2.max_rounds": 9,
+        },
+        "overcooked/coordination_ring": {
+            "phase2.first_updates": because(200, "self-play begins a round or two sooner"),
+            "phase2.starts_new": because(0.8, "it plays better, and more slowly: more of its own states"),
+            "phase2.discount": because(0.97, "with 0.99 its values run away, and scores swing between rounds"),
+            "phase2.rounds": because(14, "it is at 8 dishes after eight and at 11 to 12 after twelve"),
+            "phase2.model_lag": because(0, "measured so (docs/notes/learning.md, What holds later members back)"),
         },
         "overcooked/counter_circuit_o_1order": {
             "world_model.batch": because(32, "more and smaller updates know the kitchen sooner"),

@@ -16,8 +16,6 @@ from popgen.methods.xpm_wm.config import PREFILL_CHUNK
 from popgen.methods.xpm_wm.overlap import Overlap
 from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, ModelTask, ModelUpdate, Setup
-from popgen.methods.xpm_wm.world_model import Starts
-from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER
 
@@ -201,8 +199,9 @@ class LaterMember:
         while phase2.plays_on(progress, phase, self.most_rounds):  # 4
             update = None if phase.model_lag else self.update_world_model()  # 5-7
             starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
+            task = AgentTask(0, model, starts, 0.0, {}, progress.plays, partners=self.work.fit_partners())
             update = self.update_world_model() if phase.model_lag else update  # 5-7, beside 8-16
-            published = yield from self.learn_in_imagination(model, starts)  # 8-16
+            published = yield from self.learn_in_imagination(task)  # 8-16
             if update is not None:
                 yield Progress(self.member, progress.steps, named_figures("model", update.result().metrics))
             sampled = self.collect_real_episodes(published)  # 17, 19, 20
@@ -215,12 +214,13 @@ class LaterMember:
         """Lines 5 to 7; there is nothing new before the first real episodes."""
         return self.work.update_world_model(ModelTask(self.phase.model_updates)) if self.progress.rounds else None
 
-    def learn_in_imagination(self, model: Pending[Weights], starts: Pending[Starts]) -> Learning:
+    def learn_in_imagination(self, task: AgentTask) -> Learning:
         """Lines 8 to 15, in pieces for the progress bar: simulated self-play and cross-play with the strongest partner
         so far (9), objective (11-13), updates (14, 15)."""
         progress, plan = self.progress, phase2.plan_imagination(self.progress.rounds, self.phase)
         scores, pressed, done = progress.strength.scores(), progress.constraint.multipliers, plan.done  # 9
-        task = AgentTask(0, model, starts, plan.new_share, scores, progress.plays, self.tally(), multipliers=pressed)
+        further = {"new_share": plan.new_share, "partner_scores": scores, "multipliers": pressed}
+        task = replace(task, **further, tally=self.tally())
         while True:
             task = replace(task, updates=min(AGENT_PIECE, plan.done + plan.updates - done))
             update = self.work.update_agent(task).result()  # 11-15

@@ -59,6 +59,7 @@ class AgentTask:
         tally: of real play, where anything goes by it.
         recent: states of this member's latest self-play; None: those among `starts`.
         multipliers: of each partner's cross-play, where that is a constraint; 1 for those that are not there.
+        partners: their actors on the latents of `model`; None: as they are.
     """
 
     updates: int
@@ -70,6 +71,15 @@ class AgentTask:
     tally: Tally | None = None
     recent: Pending[Starts] | None = None
     multipliers: Mapping[int, float] = field(default_factory=dict[int, float])
+    partners: Pending[FittedPartners] | None = None
+
+
+@dataclass(frozen=True)
+class FittedPartners:
+    """Partners' actors on the present world model's latents, of those that were fitted; figures of the fits."""
+
+    actors: dict[int, Weights]
+    figures: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,10 @@ class Workers(Protocol):
 
     def cache_starts(self) -> Pending[Starts]:
         """Start states from both buffers through the present world model (lines 8 and 10)."""
+        ...
+
+    def fit_partners(self) -> Pending[FittedPartners]:
+        """The actors of those before, fitted to the latents of the present world model."""
         ...
 
     def model_weights(self) -> Pending[Weights]:

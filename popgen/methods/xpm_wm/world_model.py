@@ -12,6 +12,7 @@ the posteriors from which imagination starts.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from popgen.envs.contract import EnvSpec, ViewSpec
+from popgen.methods.xpm_wm.actor_critic import Actor, Fit, fit_actor
 from popgen.methods.xpm_wm.config import WorldModelConfig
 from popgen.methods.xpm_wm.latent_filter import (
     Latent,
@@ -530,3 +532,21 @@ def before_or_at(windows: Windows, events: tuple[int, ...]) -> np.ndarray:
     happened = np.asarray(windows.events[..., list(events)].any((2, 3)))
     happened[:, 0] = False
     return np.maximum.accumulate(happened, axis=1)
+
+
+def fit_partners(learner: ModelLearner, actors: Mapping[int, Actor], windows: Windows, steps: int) -> list[Fit]:
+    """Predecessors' actors, by member, learn to act on the present model's latents, of the windows' later half, as
+    they do on those of their archived filters: the model has changed since they were trained."""
+    batch = WindowBatch.from_windows(windows, learner.model)
+    late, obs = len(batch.is_first) // 2, (batch.obs, batch.actions, batch.is_first)
+    with torch.no_grad():
+        latent = learner.model.observe(*obs, learner.generator).latent[late:]
+    latent, fits = Latent(latent.h.flatten(0, 1), latent.z.flatten(0, 1)), []
+    both = torch.arange(learner.spec.num_players, device=learner.device).expand(len(latent.h), -1)
+    for member, actor in actors.items():
+        with torch.no_grad():
+            theirs, _ = learner.predecessors[member].observe_posterior(*obs, learner.generator)
+            theirs = Latent(theirs.h[late:].flatten(0, 1), theirs.z[late:].flatten(0, 1))
+            wanted = actor.to(learner.device).log_probs(theirs.expand_players(), both)
+        fits.append(fit_actor(actor, latent, wanted, steps, learner.rng))
+    return fits

@@ -10,11 +10,19 @@ import torch
 from support.small import MODEL, kitchen, random_windows
 from torch import Tensor
 
-from popgen.methods.xpm_wm.config import WorldModelConfig
-from popgen.methods.xpm_wm.latent_filter import from_indices
+from popgen.methods.xpm_wm.actor_critic import Actor, fit_actor
+from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
+from popgen.methods.xpm_wm.latent_filter import Latent, from_indices
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.replay import KIND_CODE, Windows
-from popgen.methods.xpm_wm.world_model import LatentFilter, ModelLearner, Observed, WindowBatch, predecessor_kl
+from popgen.methods.xpm_wm.world_model import (
+    LatentFilter,
+    ModelLearner,
+    Observed,
+    WindowBatch,
+    fit_partners,
+    predecessor_kl,
+)
 from popgen.nets import weights as w
 from popgen.runs.state_files import load_state, save_state
 from popgen.types import Kind
@@ -292,3 +300,45 @@ def test_report_goes_on_open_loop_with_the_real_actions(monkeypatch: pytest.Monk
     for number, actions in enumerate(played):
         assert np.array_equal(actions.numpy(), windows.actions[:, context + number])
     assert len(played) == OPEN_LOOP
+
+
+def random_states(rows: int, seed: int) -> Latent:
+    g = torch.Generator().manual_seed(seed)
+    sizes = (MODEL.deter, MODEL.classes * MODEL.groups)
+    return Latent(*(torch.randn(rows, size, generator=g) for size in sizes))
+
+
+def make_actor(seed: int) -> Actor:
+    torch.manual_seed(seed)
+    return Actor(AgentConfig(units=16), MODEL, SPEC.num_actions)
+
+
+def test_an_actor_is_fitted_to_the_policy_that_is_wanted() -> None:
+    """KL of (3/4, 1/4, 0, ...) from the uniform policy, worked out; then it falls to nearly nothing, and an actor that
+    acts so already is left where it is."""
+    actor, states = make_actor(0), random_states(64, 1)
+    torch.nn.init.zeros_(actor.net[-1].weight)  # type: ignore[union-attr, arg-type]
+    wanted = torch.full((64, 2, SPEC.num_actions), 1e-9)
+    wanted[..., 0], wanted[..., 1] = 0.75, 0.25
+    expected = 0.75 * np.log(0.75 * SPEC.num_actions) + 0.25 * np.log(0.25 * SPEC.num_actions)
+    fit = fit_actor(actor, states, wanted.log(), 200, np.random.default_rng(0), rows=32, rate=5e-3)
+    assert fit.before == pytest.approx(expected, abs=0.01) and 0.0 < fit.after < 0.05
+    both = torch.tensor([0, 1]).expand(64, 2)
+    with torch.no_grad():
+        own = actor.log_probs(states.expand_players(), both)
+    assert fit_actor(actor, states, own, 0, np.random.default_rng(0)) == (0.0, 0.0)
+
+
+def test_partners_act_on_the_changed_models_latents_as_they_did_on_their_own() -> None:
+    """Most of what a model that has moved on made of a partner is put right; the archived filter stays as it is."""
+    learner, windows = make_learner(), random_windows(24, 8)
+    archived = make_learner(seed=5)
+    learner.add_predecessor(1, w.weights_of(archived.model.filter))
+    before = w.weights_of(learner.predecessors[1])
+    actor = make_actor(2)
+    with torch.no_grad():
+        actor.net[-1].weight.mul_(30.0)  # type: ignore[union-attr, operator]
+    (fit,) = fit_partners(learner, {1: actor}, windows, 200)
+    assert fit.before > 0.1 and fit.after < fit.before / 2
+    for name, values in w.weights_of(learner.predecessors[1]).items():
+        np.testing.assert_array_equal(values, before[name])
