@@ -273,11 +273,22 @@ def test_a_worker_joins_the_cluster(cluster: Cluster) -> None:
     own = {"RAY_HEAD": f"127.0.0.1:{cluster.environment['RAY_PORT']}", "AGENT_PORT": str(agent)}
     environment = cluster.environment | own
     options = (f"--dashboard-agent-grpc-port={grpc}", f"--metrics-export-port={metrics}", "--num-cpus=1")
-    with open(cluster.folder / "worker.log", "wb") as log:
-        command = [ENTRY, "worker", *options, "--object-store-memory=100000000"]
-        worker = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=cluster.folder)
+    command = [ENTRY, "worker", *options, "--object-store-memory=100000000"]
+
+    def join() -> subprocess.Popen[bytes] | None:
+        """Ray gives a node's agents 15 s to start: on a busy machine that may be too few, and it does not try again."""
+        with open(cluster.folder / "worker.log", "wb") as log:
+            worker = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=cluster.folder)
+        try:
+            until("the second node", lambda: alive() == 2, worker, seconds=60)
+        except AssertionError:
+            end(worker)
+            return None
+        return worker
+
+    worker = join() or join() or join()
+    assert worker is not None, (cluster.folder / "worker.log").read_text()
     try:
-        until("the second node", lambda: alive() == 2, worker)
         health = [ENTRY, "health", "worker"]
         until("its health", lambda: subprocess.run(health, env=environment).returncode == 0, worker)
         worker.terminate()
