@@ -33,6 +33,7 @@ def test_operations_are_those_of_the_products_of_one_update() -> None:
     assert row["share_of_peak"] == pytest.approx(row["flops"] / 1e9)
 
 
+@pytest.mark.end_to_end
 def test_both_learners_are_measured_in_every_size() -> None:
     config = RunConfig.parse(compose(["method=xpm_wm", "scale=smoke"]))
     result = bench_world_model({"small": config}, seconds=0.01)  # type: ignore[dict-item]

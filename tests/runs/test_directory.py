@@ -33,6 +33,12 @@ HOLD = (
 
 
 @pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits for a lock that is not going to be free."""
+    monkeypatch.setattr(runs, "_WAIT", 0.1)
+
+
+@pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A run of three members of which one is there, with 30 random and 12 self-play steps."""
     path = tmp_path / "runs" / "first"
@@ -61,6 +67,7 @@ def elsewhere(folder: Path) -> Any:
     process.communicate()
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_living_driver_is_seen_and_keeps_others_out(folder: Path, elsewhere: Any) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     told = describe_run(folder)
@@ -71,6 +78,7 @@ def test_a_living_driver_is_seen_and_keeps_others_out(folder: Path, elsewhere: A
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_copy_elsewhere_does_not_replace_the_folder_of_a_living_driver(folder: Path, elsewhere: Any) -> None:
     copy = folder.parent / "storage"
     Mirror(folder, copy.as_uri()).push()
@@ -101,6 +109,7 @@ def test_a_driver_that_is_killed_leaves_an_interrupted_run_that_can_be_taken_up(
     assert (describe_run(folder)["state"], describe_run(folder)["attempt"]) == ("finished", 2)
 
 
+@pytest.mark.usefixtures("impatient")
 def test_one_process_has_a_run_once_and_reading_its_files_does_not_end_that(folder: Path) -> None:
     state = RunState(folder)
     with (folder / runs.LOCK).open():
@@ -111,6 +120,7 @@ def test_one_process_has_a_run_once_and_reading_its_files_does_not_end_that(fold
     RunState(folder).release()
 
 
+@pytest.mark.usefixtures("impatient")
 def test_looking_at_a_run_does_not_end_its_lock(folder: Path, elsewhere: Any) -> None:
     for _ in range(20):
         assert describe_run(folder)["state"] == "running"
