@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from pydantic import ValidationError
 from torch import Tensor, nn
@@ -113,7 +114,7 @@ def fit_actor(
 
     def divergence(part: Latent, target: Tensor) -> Tensor:
         log_probs = actor.log_probs(part.expand_players(), both.expand(target.shape[:2]))
-        return (target.exp() * (target - log_probs)).sum(-1).mean()
+        return F.kl_div(log_probs, target, reduction="none", log_target=True).sum(-1).mean()
 
     with torch.no_grad():
         before = float(divergence(latent, wanted))
