@@ -44,7 +44,7 @@ def make_all(pieces: Pieces, reporter: Reporter) -> dict[str, Record]:
     """Make what is missing; a piece that fails does not hold up the others. Gives the targets' records by name."""
     for folder in ("runs", "pieces", "measured"):
         (pieces.plan.out / folder).mkdir(parents=True, exist_ok=True)
-    jobs = list(pieces.jobs.values())
+    jobs = pieces.list_all_jobs()
     for number, job in enumerate(jobs, start=1):
         if not job.done and pieces.plan.trains:
             reporter.note(f"piece {number} of {len(jobs)}: {job.wanted.row}, seed {job.wanted.seed}")
@@ -139,6 +139,8 @@ def make_record(pieces: Pieces, target: Target) -> Record:
         job = pieces.find_job(run)
         if job.done and all(pieces.is_measured(job, name) for name in run.measures):
             runs.append(_describe_run(pieces, run, job))
+        elif (told := pieces.find_recorded(target, run)) is not None:
+            runs.append(told)
         else:
             why = job.failed or "not made yet"
             missing.append({"row": run.row, "environment": pieces.find_environment(run), "seed": run.seed, "why": why})
@@ -168,6 +170,7 @@ def _describe_run(pieces: Pieces, run: WantedRun, job: Job) -> dict[str, Any]:
         "seed": run.seed,
         "command": pieces.describe_command(job),
         "run": job.folder.name,
+        "settings_digest": pieces.digest_settings(run),
         "commit": last.get("commit"),
         "changed": last.get("changed"),
         "versions": {name: last.get(name) for name in ("popgen", "python", "torch", "numpy")},

@@ -12,7 +12,7 @@ from typing import Any
 from popgen.config.run_config import RunConfig
 from popgen.durable_files import replace_file
 from popgen.pipelines.run_batch import named
-from popgen.reports.reproduction.target_records import Budget, Target, WantedRun, WantedStudy
+from popgen.reports.reproduction.target_records import Budget, Record, Target, WantedRun, WantedStudy
 from popgen.reports.run_record import differences, is_finished, planned_run, read_run
 
 ALL_LAYOUTS = "overcooked/all layouts"
@@ -33,6 +33,7 @@ class Plan:
         command: that makes it again.
         compose: overrides -> a checked configuration.
         elsewhere: folders with finished runs that are taken instead of new ones.
+        records: earlier records, whose figures are kept where a run of today would have the same settings.
         trains: runs that are missing are made; without it what is finished is measured and told.
     """
 
@@ -44,6 +45,7 @@ class Plan:
     command: str
     compose: Callable[[Sequence[str]], RunConfig]
     elsewhere: Sequence[Path] = ()
+    records: Sequence[Record] = ()
     trains: bool = True
 
 
@@ -96,6 +98,7 @@ class Pieces:
         for runs in self.wanted.values():
             for run in runs:
                 self._add_job(run)
+        self._recorded = {target.name: self._find_recorded(target) for target in plan.targets}
 
     def find_job(self, run: WantedRun) -> Job:
         """The job that makes a wanted run."""
@@ -131,6 +134,30 @@ class Pieces:
         digest = hashlib.sha256(" ".join((teacher.folder.name, *words)).encode()).hexdigest()[:8]
         return Job(run, self.plan.out / "runs" / f"ego-{teacher.folder.name}-{digest}", None, words)
 
+    # What earlier records tell
+
+    def digest_settings(self, run: WantedRun) -> str:
+        """Of everything that decides a run's figures: its settings, and those of the runs that it needs."""
+        job = self.find_job(run)
+        own: object = list(job.words)
+        if job.config is not None:
+            planned = planned_run(job.config)
+            own = [planned.environment.fingerprint, planned.method, job.config.population.size, planned.settings]
+        parts = [run.seed, own, [self.digest_settings(needed) for needed in run.needs]]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+    def _find_recorded(self, target: Target) -> dict[WantedRun, dict[str, Any]]:
+        """Entries of earlier records, with as many episodes, by the run of today that they stand for."""
+        same = [one for one in self.plan.records if one["target"] == target.name]
+        runs = [run for one in same if one["episodes"] == self.plan.budget.episodes for run in one["runs"]]
+        entries = {(run["row"], run.get("settings_digest")): run for run in runs}
+        found = {run: entries.get((run.row, self.digest_settings(run))) for run in self.wanted[target.name]}
+        return {run: one for run, one in found.items() if one is not None and set(run.measures) <= set(one["figures"])}
+
+    def find_recorded(self, target: Target, run: WantedRun) -> dict[str, Any] | None:
+        """What an earlier record tells of a run; None where none does, or the run is here."""
+        return None if self.find_job(run).done else self._recorded[target.name].get(run)
+
     # What is there
 
     def is_measured(self, job: Job, name: str) -> bool:
@@ -149,20 +176,28 @@ class Pieces:
 
     def count_pieces(self, target: Target) -> dict[str, int]:
         """Of a target: runs, runs done, measures, measures done."""
-        jobs = self.list_jobs(target)
-        own = [(self.find_job(run), name) for run in self.wanted[target.name] for name in run.measures]
+        jobs, wanted = self.list_jobs(target), self.wanted[target.name]
+        told = [run for run in wanted if self.find_recorded(target, run) is not None]
+        own = [(self.find_job(run), name) for run in wanted if run not in told for name in run.measures]
         measures = list({(str(job.folder), name): (job, name) for job, name in own}.values())
+        measures_told = sum(len(run.measures) for run in told)
         return {
-            "runs": len(jobs),
-            "runs_done": sum(job.done for job in jobs),
-            "measures": len(measures),
-            "measures_done": sum(self.is_measured(job, name) for job, name in measures),
+            "runs": len(jobs) + len(told),
+            "runs_done": sum(job.done for job in jobs) + len(told),
+            "measures": len(measures) + measures_told,
+            "measures_done": sum(self.is_measured(job, name) for job, name in measures) + measures_told,
         }
 
+    def list_all_jobs(self) -> list[Job]:
+        """Of all targets, each once."""
+        return list({str(job.folder): job for target in self.plan.targets for job in self.list_jobs(target)}.values())
+
     def list_jobs(self, target: Target) -> list[Job]:
-        """Of a target, what its runs need first."""
+        """Of a target, what its runs need first; without runs that an earlier record tells."""
         found: dict[str, Job] = {}
         for run in self.wanted[target.name]:
+            if self.find_recorded(target, run) is not None:
+                continue
             for one in (*run.needs, run):
                 job = self.find_job(one)
                 found[str(job.folder)] = job
@@ -171,7 +206,7 @@ class Pieces:
     def estimate_seconds(self, target: Target | None = None) -> float:
         """That what is left will take: runs of the same kind as long as those that are done, others as the budget says;
         of one target, or of all pieces once."""
-        jobs = list(self.jobs.values()) if target is None else self.list_jobs(target)
+        jobs = self.list_all_jobs() if target is None else self.list_jobs(target)
         times: dict[str, list[float]] = {}
         for job in self.jobs.values():
             seconds = read_json(self.find_piece(job)).get("seconds")

@@ -50,6 +50,12 @@ def add(commands: Any) -> None:
     parser.add_argument(
         *("--runs",), action="append", default=[], type=expand_home, metavar="DIR", help="take finished runs from here"
     )
+    parser.add_argument(
+        *("--records",),
+        metavar="DIR",
+        default=None,
+        help="keep what earlier records in here tell of runs with the same settings",
+    )
     parser.add_argument("--dry-run", action="store_true", help="show what is done and what is left, start nothing")
     parser.add_argument("--finished", action="store_true", help="train nothing: measure and tell what is finished")
     parser.add_argument("--publish", metavar="DIR", default=None, help="copy the targets' records to here")
@@ -91,6 +97,7 @@ def reproduce(args: argparse.Namespace) -> int:
 
 def _plan_pieces(args: argparse.Namespace) -> Pieces:
     from popgen.pipelines.reproduction_pieces import Pieces, Plan
+    from popgen.reports.reproduction.results_page import read_records
     from popgen.reports.reproduction.target_registry import find_targets
     from popgen.runs.preflight import check_root
 
@@ -109,6 +116,7 @@ def _plan_pieces(args: argparse.Namespace) -> Pieces:
         " ".join(map(shlex.quote, words)),
         _make_composer([*budget.settings, *budget.rendezvous, *args.overrides], args.config_dir),
         [Path(folder) for folder in args.runs],
+        [] if args.records is None else read_records(Path(args.records)),
         trains=not args.finished,
     )
     return Pieces(plan)

@@ -149,6 +149,35 @@ def test_finished_runs_of_elsewhere_are_taken_if_they_are_the_same(
     assert len(training.calls) == 8  # of another seed
 
 
+def test_what_an_earlier_record_tells_is_not_made_again(run: Run, training: Training, tmp_path: Path) -> None:
+    """Three of four runs are in a record, and their folders are gone: the fourth is made, and the new record has all
+    four, the three as they were."""
+    training.refused = {"comedi"}
+    assert run("reproduce", "wall-clock", *SMALL, "--publish", "kept")[0] == 2
+    before = json.loads((tmp_path / "kept" / "wall-clock-smoke.json").read_text())
+    assert [one["row"] for one in before["runs"]] == ["XPM-WM", "XPM-Sim", "LIPO"]
+    shutil.rmtree(tmp_path / "out")
+    training.refused = set()
+    again = ("reproduce", "wall-clock", *SMALL, "--records", "kept")
+    code, out, _ = run(*again, "--dry-run", "--json")
+    told = json.loads(out)["targets"][0]
+    assert code == 0 and (told["runs_done"], told["runs"], told["measures_done"], told["measures"]) == (3, 4, 3, 4)
+    assert run(*again)[0] == 0 and [config.method for config in training.calls[4:]] == ["comedi"]
+    after = json.loads((tmp_path / "out" / "wall-clock" / "record.json").read_text())
+    assert after["runs"][:3] == before["runs"] and after["runs"][3]["row"] == "CoMeDi" and after["missing"] == []
+
+
+@pytest.mark.parametrize("change", ["population.size=3", "world_model.kl_predecessors=0.5", "--seeds 2"])
+def test_a_record_of_other_settings_tells_nothing(run: Run, training: Training, tmp_path: Path, change: str) -> None:
+    assert run("reproduce", "wall-clock", *SMALL, "--publish", "kept")[0] == 0
+    shutil.rmtree(tmp_path / "out")
+    code, out, _ = run(
+        "reproduce", "wall-clock", *SMALL, *change.split(), "--records", "kept", "--dry-run", "--json"
+    )
+    done = json.loads(out)["targets"][0]["runs_done"]
+    assert code == 0 and done == (3 if "kl_predecessors" in change else 0), "only XPM-WM has that setting"
+
+
 def test_the_list_and_the_page(run: Run, training: Training, tmp_path: Path) -> None:
     code, out, _ = run("reproduce", "--list")
     assert (

@@ -15,8 +15,9 @@ A record is a JSON object of less than 50 KB (`popgen.pipelines.reproduce` write
     episodes                 of every evaluation that was made for the target
     command                  that makes it again
     written                  day
-    runs                     one for each run: row, method, environment, seed, command, run (name of its folder), commit
-                             and changed (null where unknown), versions, machine (null where unknown), taken_over (made
-                             before and taken from elsewhere), seconds, figures (measure -> name -> number or numbers)
+    runs                     one for each run: row, method, environment, seed, command, run (name of its folder),
+                             settings_digest (of what decides its figures), commit and changed (null where unknown),
+                             versions, machine (null where unknown), taken_over (made before and taken from elsewhere),
+                             seconds, figures (measure -> name -> number or numbers)
     missing                  rows of runs that are not there: row, environment, seed, why
 """
