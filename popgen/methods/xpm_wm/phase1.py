@@ -21,6 +21,8 @@ from popgen.play.episodes import Episode
 RANDOM_PLAY, MODEL_ALONE, SELF_PLAY = "random play", "world model", "self-play"
 CONFIRMED = 0.97
 """Share of the target that the last policy must reach by itself."""
+RISING, FORESEEN = 0.02, 0.5
+"""Shares of the target: where scores begin to rise, and from where on they foretell when it will be reached."""
 GOOD_ENOUGH = 0.95
 """Share of the best window from which on the last weights are taken, which learned longer."""
 
@@ -34,6 +36,7 @@ class FirstMemberProgress:
         steps: environment steps so far.
         rounds: that have ended.
         since_best: rounds since the best window, once there was one.
+        rose_from: steps at the end of the last round before scores rose.
         mark, since_gain: the window that last counted as a gain, and the rounds since, once self-play has begun.
         confirmations: how often the last policy has been looked at by itself.
         restarted: actor and critics have started again.
@@ -51,6 +54,7 @@ class FirstMemberProgress:
     steps: int = 0
     rounds: int = 0
     since_best: int = 0
+    rose_from: int = 0
     mark: float = 0.0
     since_gain: int = 0
     confirmations: int = 0
@@ -94,6 +98,7 @@ class FirstMemberProgress:
         return {
             "rounds": self.rounds,
             "since_best": self.since_best,
+            "rose_from": self.rose_from,
             "mark": self.mark,
             "since_gain": self.since_gain,
             "confirmations": self.confirmations,
@@ -118,6 +123,7 @@ class FirstMemberProgress:
             steps,
             rounds=int(state["rounds"]),
             since_best=int(state["since_best"]),
+            rose_from=int(state["rose_from"]),
             mark=float(state["mark"]),
             since_gain=int(state["since_gain"]),
             confirmations=int(state["confirmations"]),
@@ -178,6 +184,16 @@ def should_stop(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
     return progress.steps >= phase.max_steps or is_done(progress, phase) or progress.since_best >= phase.patience
 
 
+def foresee_end(progress: FirstMemberProgress, phase: Phase1Config) -> float | None:
+    """Steps of self-play at which the target will be reached, if scores rise as they have so far; None where a plateau
+    ends the phase, or scores are still too low to tell."""
+    score, target = mean_score(progress), phase.target_score
+    if phase.plateau or score < FORESEEN * target:
+        return None
+    missing = max(0.0, target / score - 1.0) * (progress.steps - progress.rose_from)
+    return min(float(self_play_steps(phase)), count_self_play(progress, phase) + missing)
+
+
 def restart_is_due(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
     """Whether actor and critics start again, once (an actor can get stuck, a model less)."""
     wanted = phase.restart_updates > 0 and not progress.restarted
@@ -232,8 +248,8 @@ def describe_first_round(progress: FirstMemberProgress, phase: Phase1Config, sco
     """The round that has ended, with the figures so far."""
     figures, steps, member = dict(progress.figures), progress.steps, 1
     shown = {"steps": steps, score_name: round(figures.get("real_sp", 0.0), 2)}
-    done = count_self_play(progress, phase)
-    return Round(member, steps, figures, done=done, shown=shown, number=progress.rounds)
+    done, ends_at = count_self_play(progress, phase), foresee_end(progress, phase)
+    return Round(member, steps, figures, done=done, ends_at=ends_at, shown=shown, number=progress.rounds)
 
 
 def describe_confirmation(progress: FirstMemberProgress, score: float, episodes: int, score_name: str) -> str:
@@ -244,6 +260,8 @@ def describe_confirmation(progress: FirstMemberProgress, score: float, episodes:
 
 def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after: float) -> None:
     """Remember the policy that played, not the one learned meanwhile; rounds count once there is a full window."""
+    if mean_score(progress) < RISING * phase.target_score:
+        progress.rose_from = progress.steps
     if not has_full_window(progress):
         return
     score = mean_score(progress)

@@ -53,6 +53,19 @@ def test_patience_begins_when_there_is_a_window_to_judge_by() -> None:
     assert first.since_best == 0 and not phase1.should_stop(first, phase)
 
 
+def test_scores_foretell_when_the_target_is_reached() -> None:
+    """0 at 300 steps, 5 of 8 at 400: 3 more take 60; nothing is foretold below half of it, or where a plateau ends it."""
+    first, phase = member(), Phase1Config(target_score=8.0, prefill_steps=200, max_steps=1000)
+    for steps, score in ((300, 0.1), (360, 3.0), (400, 5.0)):
+        first.steps = steps
+        play(first, phase, *[score] * 16)
+        ended = phase1.describe_first_round(first, phase, "dishes")
+        assert ended.ends_at == (pytest.approx(260.0) if steps == 400 else None)
+    first.steps = 950
+    assert phase1.foresee_end(first, phase) == 800.0, "the budget ends it"
+    assert phase1.foresee_end(first, Phase1Config(target_score=8.0, plateau=10)) is None
+
+
 def test_the_target_needs_a_whole_window_and_the_budget_does_not() -> None:
     first, phase = member(), Phase1Config(target_score=5.0, max_steps=100)
     first.add_scores([8.0] * 15, [])
@@ -218,12 +231,12 @@ def test_progress_of_member_1_comes_back_from_a_checkpoint() -> None:
     first, phase = member(), Phase1Config(target_score=4.0)
     play(first, phase, *map(float, range(20)))
     first.rounds, first.confirmations, first.restarted, first.figures = 7, 2, True, {"model/loss": 0.5}
-    first.mark, first.since_gain = 4.5, 2
+    first.mark, first.since_gain, first.rose_from = 4.5, 2, 16
     first.recent_starts = Ready(Starts(*(np.ones((1, 2)) for _ in range(4))))
     first.model, first.starts = Ready({"m": np.ones(3)}), Ready(Starts(*(np.zeros((2, 2)) for _ in range(4))))
     again = FirstMemberProgress.from_state(saved(first), 16, 40, InlineTransport().put)
     assert again.steps == 40 and again.played is None  # set when the first sampler starts
-    counters = ("rounds", "since_best", "confirmations", "restarted", "plays", "mark", "since_gain")
+    counters = ("rounds", "since_best", "confirmations", "restarted", "plays", "mark", "since_gain", "rose_from")
     for name in (*counters, "recent", "shaped", "figures"):
         assert getattr(again, name) == getattr(first, name)
     assert again.recent.maxlen == 16 and again.plays
