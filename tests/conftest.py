@@ -103,6 +103,16 @@ def run(
     return call
 
 
+@pytest.fixture
+def new_parser() -> Iterator[None]:
+    """The command line takes in a command that the test replaces, and forgets it after the test."""
+    from popgen.cli.parser import _parser
+
+    _parser.cache_clear()
+    yield
+    _parser.cache_clear()
+
+
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[None]:
     """A Ray of the module's own; its sockets need a short path."""

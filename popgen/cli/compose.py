@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
 import json
 import math
+import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -30,14 +30,15 @@ OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take an
 
 
 QUOTES = "'\""
+MISSING = "???"  # OmegaConf's mark
 CUSTOM_LAYOUT = "env=overcooked/custom"
 SEVERAL_RUNS = "popgen sweep makes several runs"
 
 CHOICES = ("method", "scale", "env")
 """Groups that decide which schema and which recipe the other settings stand on."""
 
-_COMPOSED: dict[str, DictConfig] = {}
-"""What this process has composed of conf/ and groups, by all that it depends on."""
+_COMPOSED: dict[str, bytes] = {}
+"""What this process has composed of conf/ and groups, by all that it depends on; pickled, which copies it fastest."""
 
 
 @dataclass(frozen=True)
@@ -285,8 +286,8 @@ def _compose(
         groups, fields = _split_fields(translated)
         config = _compose_groups(base, groups, folder)
         ConfigLoaderImpl._apply_overrides_to_config(fields, config)
-        missing = sorted(OmegaConf.missing_keys(config))
         values = OmegaConf.to_container(config, resolve=not loose)
+        missing = [] if loose or MISSING not in repr(values) else sorted(OmegaConf.missing_keys(config))
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # the last for a number as a group's option
         raise _composition_error(error, overrides, folder, unknown) from None
     assert isinstance(values, dict)
@@ -322,14 +323,14 @@ def _compose_groups(base: dict[str, Any], words: list[str], folder: Path | None)
     installed = _installed_options()
     name = json.dumps([base, words, {group: sorted(options) for group, options in installed.items()}])
     if folder is None and name in _COMPOSED:
-        return copy.deepcopy(_COMPOSED[name])
+        return pickle.loads(_COMPOSED[name])
     _store_groups(base, installed, folder)
     GlobalHydra.instance().clear()
     search = [] if folder is None else [f"hydra.searchpath=[{json.dumps(folder.as_uri())}]"]
     with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
         config = hydra_compose("config", [*search, *words])
     if folder is None:
-        _COMPOSED[name] = copy.deepcopy(config)
+        _COMPOSED[name] = pickle.dumps(config)
     return config
 
 
@@ -413,7 +414,7 @@ def _quote_text(text: str) -> str:
 
 def _unset(values: Any, prefix: str = "") -> list[str]:
     """Keys whose interpolation gave the mark of a missing value."""
-    if values == "???":
+    if values == MISSING:
         return [prefix]
     items = values.items() if isinstance(values, dict) else ()
     return [key for name, item in items for key in _unset(item, f"{prefix}.{name}" if prefix else str(name))]

@@ -268,6 +268,7 @@ def test_a_small_disk_is_refused(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     refused(run("run"), "run.root", "free")
 
 
+@pytest.mark.usefixtures("new_parser")
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_a_disk_that_fills_up_is_one_line(number: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: Any) -> int:
@@ -277,6 +278,7 @@ def test_a_disk_that_fills_up_is_one_line(number: int, run: Run, monkeypatch: py
     refused(run("show", "."), "runs/r/ledger.jsonl", "disk")
 
 
+@pytest.mark.usefixtures("new_parser")
 def test_an_error_of_ours_keeps_its_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def wrong(_: Any) -> int:
         raise OSError(errno.EIO, "the driver's own trouble")
@@ -286,6 +288,7 @@ def test_an_error_of_ours_keeps_its_traceback(run: Run, monkeypatch: pytest.Monk
         run("show", ".")
 
 
+@pytest.mark.usefixtures("new_parser")
 def test_interruption_gives_130(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def stopped(_: Any) -> int:
         raise KeyboardInterrupt

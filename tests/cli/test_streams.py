@@ -96,6 +96,7 @@ def test_a_stream_of_progress_is_asked_for_all_else() -> None:
     assert stream.write("text") == 4 and stream.getvalue() == "text" and not stream.isatty()
 
 
+@pytest.mark.usefixtures("new_parser")
 def test_another_broken_pipe_is_no_success(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     from popgen.cli import population_commands
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -123,6 +124,25 @@ def test_what_was_composed_before_changes_nothing(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("popgen.cli.compose._COMPOSED", {})
     assert again == compose(words) and other == compose(words[:1])
     assert (again["run"]["seed"], again["agent"]["lambda_xp"], again["env"]["params"]["cooking"]) == (4, 0.3, "auto")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["method=lipo", "scale=demo", "env=rendezvous/mppmr", "tracking=off"],
+        ["agent={units: 8}", "+env.params.extra=1", "run.id=${run.seed}", "~cluster"],
+        ["agent.units=1,2"],
+        ["+moon/sea=1"],
+    ],
+)
+def test_an_empty_folder_of_groups_changes_nothing(words: list[str], tmp_path: Path) -> None:
+    def outcome(folder: str | None) -> Any:
+        try:
+            return compose(words, folder)
+        except UserError as error:
+            return str(error)
+
+    assert outcome(None) == outcome(str(tmp_path))
 
 
 def test_dictionaries_take_new_keys_without_a_sign() -> None:

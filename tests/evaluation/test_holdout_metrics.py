@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import trim_mean
 
 from popgen.evaluation.holdout_metrics import (
     bootstrap_interval,
@@ -57,6 +56,8 @@ def test_the_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 33])
 def test_the_interquartile_mean_is_scipys(count: int) -> None:
+    from scipy.stats import trim_mean  # here, as every worker imports this file, and this takes a second
+
     scores = np.random.default_rng(count).normal(size=(3, count)).round(1)
     assert interquartile_mean(scores) == trim_mean(scores, 0.25, axis=None)
 

@@ -25,7 +25,7 @@ def estimate_needs(config: WorldModelRun, spec: EnvSpec) -> Needs:
     """Bytes. A finished member leaves the buffers behind, and the world model with its optimiser; the running one's
     checkpoints hold two copies and a log of the buffers, and one more is being written."""
     model, agent = config.world_model, config.agent
-    member = FLOAT * count_numbers(lambda: _build_networks(config, spec)) if model.view in spec.views else 0
+    member = FLOAT * _count_member(config, spec) if model.view in spec.views else 0
     buffers = 2 * buffer_bytes(config.replay.capacity, spec)
     windows = model.batch * model.length * spec.num_players * observation_entries(spec, model.view)
     latents = (agent.starts_sp + agent.starts_xp) * agent.horizon * (model.deter + model.classes * model.groups)
@@ -42,14 +42,14 @@ def estimate_needs(config: WorldModelRun, spec: EnvSpec) -> Needs:
     )
 
 
-def _build_networks(config: WorldModelRun, spec: EnvSpec) -> list[object]:
-    """World model, actor, and a critic for each partner of the last member."""
+def _count_member(config: WorldModelRun, spec: EnvSpec) -> int:
+    """Numbers in world model, actor, and a critic for each partner of the last member."""
     from popgen.methods.xpm_wm.actor_critic import Actor, Critic
     from popgen.methods.xpm_wm.world_model import WorldModel
 
     model, agent = config.world_model, config.agent
-    critics = [Critic(agent, model) for _ in range(config.population.size)]
-    return [WorldModel(model, spec), Actor(agent, model, spec.num_actions), *critics]
+    once = count_numbers(lambda: [WorldModel(model, spec), Actor(agent, model, spec.num_actions)])
+    return once + config.population.size * count_numbers(lambda: [Critic(agent, model)])
 
 
 def check_run(config: WorldModelRun, spec: EnvSpec) -> None:
