@@ -188,7 +188,7 @@ def foresee_end(progress: FirstMemberProgress, phase: Phase1Config) -> float | N
     """Steps of self-play at which the target will be reached, if scores rise as they have so far; None where a plateau
     ends the phase, or scores are still too low to tell."""
     score, target = mean_score(progress), phase.target_score
-    if phase.plateau or score < FORESEEN * target:
+    if phase.plateau or score <= 0.0 or score < FORESEEN * target:
         return None
     missing = max(0.0, target / score - 1.0) * (progress.steps - progress.rose_from)
     return min(float(self_play_steps(phase)), count_self_play(progress, phase) + missing)

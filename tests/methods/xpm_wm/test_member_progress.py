@@ -54,7 +54,7 @@ def test_patience_begins_when_there_is_a_window_to_judge_by() -> None:
 
 
 def test_scores_foretell_when_the_target_is_reached() -> None:
-    """0 at 300 steps, 5 of 8 at 400: 3 more take 60; nothing is foretold below half of it, or where a plateau ends it."""
+    """0 at 300 steps, 5 of 8 at 400: 3 more take 60; nothing below half of it, or where a plateau ends it."""
     first, phase = member(), Phase1Config(target_score=8.0, prefill_steps=200, max_steps=1000)
     for steps, score in ((300, 0.1), (360, 3.0), (400, 5.0)):
         first.steps = steps
@@ -64,6 +64,16 @@ def test_scores_foretell_when_the_target_is_reached() -> None:
     first.steps = 950
     assert phase1.foresee_end(first, phase) == 800.0, "the budget ends it"
     assert phase1.foresee_end(first, Phase1Config(target_score=8.0, plateau=10)) is None
+
+
+@pytest.mark.parametrize("target", [0.0, -2.0])
+@pytest.mark.parametrize("score", [0.0, -1.0, 1.0])
+def test_a_target_that_anybody_reaches_needs_no_rise_to_be_foretold(target: float, score: float) -> None:
+    """From no score nothing can be foretold; one above such a target ends the phase where it is."""
+    first, phase = member(), Phase1Config(target_score=target, prefill_steps=200, max_steps=1000)
+    first.steps = 400
+    play(first, phase, score)
+    assert phase1.foresee_end(first, phase) == (200.0 if score > 0.0 else None)
 
 
 def test_the_target_needs_a_whole_window_and_the_budget_does_not() -> None:
