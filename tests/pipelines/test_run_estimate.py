@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,13 +17,15 @@ from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.methods.mappo.comedi import OBJECTIVE as COMEDI
-from popgen.methods.mappo.config import BaselineRun
+from popgen.methods.mappo.config import BaselineRun, FcpRun
+from popgen.methods.mappo.fcp import FcpTraining
 from popgen.methods.mappo.lipo import OBJECTIVE as LIPO
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.train import RllibTraining
 from popgen.methods.training import Phase, PlannedPhase, State, Work
-from popgen.methods.xpm_wm.config import XpmWmRun
-from popgen.methods.xpm_wm.member_training import plan_phases
+from popgen.methods.xpm_wm.config import FcpWmRun, XpmWmRun
+from popgen.methods.xpm_wm.member_training import FIT_SECONDS, plan_phases
+from popgen.methods.xpm_wm.skilled_training import FcpWmTraining
 from popgen.pipelines import training_driver
 from popgen.pipelines.population import run_population
 from popgen.pipelines.training_driver import RunEstimate, costs_of, plan_evaluation
@@ -54,7 +56,8 @@ class Stretch:
 
 @cache
 def demo_plan(transport: str = "ray") -> list[PlannedPhase]:
-    config = RunConfig.parse(compose(["env=overcooked/cramped_room", "scale=demo", f"run.transport={transport}"]))
+    words = ["env=overcooked/cramped_room", "scale=demo", "phase2.partner_fits=0"]  # recorded before there were fits
+    config = RunConfig.parse(compose([*words, f"run.transport={transport}"]))
     assert isinstance(config, XpmWmRun)
     spec = make_env(config.env.name, 1).spec
     return [*plan_phases(config, spec), plan_evaluation(config, spec)]
@@ -372,3 +375,33 @@ def test_baselines_plan_a_phase_for_each_group_of_members(
     assert [(phase.member, phase.last) for phase in plan] == groups
     costs = [sum(costs_of(phase).values()) for phase in plan]
     assert min(costs) > 0.0 and costs == sorted(costs), "whoever meets more partners takes longer"
+
+
+def test_a_seed_of_several_members_is_planned_once() -> None:
+    """Of the three members that a seed gives, the final one alone is trained: its number is that of the phase."""
+    words = ["env=overcooked/cramped_room", "scale=smoke"]
+    free = RunConfig.parse(compose([*words, "method=fcp", "population.size=6"]))
+    imagined = RunConfig.parse(compose([*words, "method=fcp_wm", "population.size=7"]))
+    assert isinstance(free, FcpRun) and isinstance(imagined, FcpWmRun)
+    spec = make_env(free.env.name, 1).spec
+    assert [phase.member for phase in FcpTraining(free, spec, "run.1").plan()] == [3, 6]
+    plan = FcpWmTraining(imagined, spec, cast(Any, None)).plan()
+    assert [(phase.name, phase.member) for phase in plan] == [
+        *((name, 1) for name in ("random play", "world model", "self-play")),
+        *(("imagination", final) for final in (4, 7)),
+    ]
+
+
+def test_fits_of_partners_are_part_of_what_a_member_takes() -> None:
+    """100 steps on 512 states in 2 seats, for each of 2 partners, in each of at most 4 rounds; none where nobody is
+    met."""
+    words = ["env=overcooked/cramped_room", "scale=smoke", "population.size=3", "phase2.rounds=4"]
+
+    def agents_cost(fits: int, *more: str) -> float:
+        config = RunConfig.parse(compose([*words, f"phase2.partner_fits={fits}", *more]))
+        assert isinstance(config, XpmWmRun | FcpWmRun)
+        return costs_of(plan_phases(config, make_env(config.env.name, 1).spec)[-1])["agent"]
+
+    assert agents_cost(100) - agents_cost(0) == pytest.approx(4 * 2 * 100 * 512 * 2 * FIT_SECONDS)
+    alone = ("agent.lambda_xp=0", "phase2.episodes_xp=0")
+    assert agents_cost(100, *alone) == agents_cost(0, *alone)

@@ -16,7 +16,7 @@ from popgen.methods.mappo.objective import SELF_PLAY
 from popgen.methods.mappo.train import RllibTraining, refuse_inline
 from popgen.methods.mappo.training_job import policy_config
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
-from popgen.methods.training import Checkpoint, Loop, State, TrainedMember, Transport
+from popgen.methods.training import Checkpoint, Loop, PlannedPhase, State, TrainedMember, Transport
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import SKILLS
 
@@ -31,6 +31,10 @@ class FcpTraining(RllibTraining):
     def first_of_group(self, member: int) -> int:
         """The initial member of the seed that `member` is of."""
         return member - (member - 1) % len(SKILLS)
+
+    def plan(self) -> list[PlannedPhase]:
+        """RLlib trains the final member of each seed alone."""
+        return [phase for phase in super().plan() if phase.member % len(SKILLS) == 0]
 
     def begin(self, first: int) -> tuple[int, ...]:
         """RLlib trains the final member; the others are kept on the way."""

@@ -59,7 +59,7 @@ class XpmSimTraining:
         self.policy = make_actor(self.config, spec)
         self.archive: dict[int, Pending[Weights]] = {}
         self.encoder: Pending[State | None] | None = None
-        self.member, self.seed = 0, 0
+        self.member, self.seed, self.began = 0, 0, time.time()
         self.partners: list[int] = []
         self.pairs: list[tuple[int, int]] = []
         self.progress, self.strength = MemberProgress(), PartnerStrength(self.config.partner)
@@ -68,7 +68,7 @@ class XpmSimTraining:
 
     def train(self) -> Loop:
         """Real episodes and updates in turn, to the end of the member."""
-        config, now, began = self.config, self.progress, time.time()
+        config, now = self.config, self.progress
         yield Phase(SIMULATED_PLAY, config.updates, self.member, done=now.updates)
         if now.rounds:
             yield Progress(
@@ -89,7 +89,7 @@ class XpmSimTraining:
             learned = (learning or self.workers.learn(updates)).result()
             ingested.result()
             yield self._end_round(learned, updates)
-        yield from self._finish_member(began)
+        yield from self._finish_member()
 
     def _play_episodes(self) -> list[Sampled]:
         """One episode in each environment."""
@@ -137,13 +137,13 @@ class XpmSimTraining:
         self.progress.simulated += steps
         return StepCount(self.member, Kind.SIMULATED, f"{name}.{self.attempt}", sequence, steps, trajectories)
 
-    def _finish_member(self, began: float) -> Loop:
+    def _finish_member(self) -> Loop:
         """Check the member, and hand it over."""
         now, check = self.progress, self.workers.check().result()
         counted = self._count_simulated("check", 0, check.steps, 0)
         figures = {f"check/{name}": value for name, value in check.figures.items()}
         yield Progress(self.member, now.steps, figures, counted=(counted,))
-        critics, seconds = prefixed("critics", self.workers.critics().result()), time.time() - began
+        critics, seconds = prefixed("critics", self.workers.critics().result()), time.time() - self.began
         self.encoder = self.workers.encoder()
         weights = self.acting.result()
         self.archive[self.member] = self.workers.put(weights)
@@ -183,7 +183,7 @@ class XpmSimTraining:
 
     def begin(self, first: int) -> tuple[int, ...]:
         """See `Training`."""
-        self.member, self.seed = first, self.run.seed * 1000 + first
+        self.member, self.seed, self.began = first, self.run.seed * 1000 + first, time.time()
         self.partners = sorted(self.archive)
         self.pairs = seatings(first, self.partners, self.seed)
         self.progress, self.strength = MemberProgress(), PartnerStrength(self.config.partner)
@@ -196,7 +196,8 @@ class XpmSimTraining:
         """See `Training`."""
         progress, strength = asdict(self.progress), self.strength.state()
         state = {"progress": progress, "strength": strength, "constraint": self.constraint.state()}
-        return state | {"workers": self.workers.state(), "acting": self.acting}
+        state |= {"workers": self.workers.state(), "acting": self.acting, "seconds": time.time() - self.began}
+        return state
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """See `Training`."""
@@ -207,6 +208,7 @@ class XpmSimTraining:
         self.constraint.load_state(state["constraint"])
         self.policy.load(state["acting"])  # refuses weights of other sizes
         self.acting = self.workers.put(state["acting"])
+        self.began -= float(state.get("seconds", 0.0))  # an earlier version did not keep them
 
     def buffers(self) -> State:
         """The learner's state holds them."""

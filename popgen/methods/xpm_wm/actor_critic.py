@@ -87,6 +87,10 @@ class Actor(nn.Module):
         return writer.finish(writer.add_layers(self.net, inputs), unimix=self.config.unimix)
 
 
+FIT_ROWS = 512
+"""States in a step of `fit_actor`."""
+
+
 class Fit(NamedTuple):
     """What `fit_actor` did: KL in nats from the wanted policy to the actor's, before and after, over the states."""
 
@@ -101,7 +105,7 @@ def fit_actor(
     steps: int,
     rng: np.random.Generator,
     *,
-    rows: int = 512,
+    rows: int = FIT_ROWS,
     rate: float = 1e-3,
 ) -> Fit:
     """Train `actor` until it acts in the states (R, .) as `wanted`, log-probabilities by seat, says.

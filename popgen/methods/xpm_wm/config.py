@@ -294,7 +294,8 @@ class Phase2Config(Schema):
     """World-model updates in each round after the first."""
     partner_fits: NonNegative = 0
     """Gradient steps by which each partner's actor is fitted anew, before imagination, to act on the present world
-    model's latents as it does on its own; 0: it acts on them as it is."""
+    model's latents as it does on its own; 0: it acts on them as it is. Nothing is fitted where members meet nobody and
+    `agent.surprise` is 0."""
     model_lag: Annotated[_Int, Field(ge=0, le=1)] = 0
     """1: the world model learns beside the agent, which imagines with that of the round before; 0: before the agent
     does. Where imagination starts from is up to date in both."""
@@ -308,7 +309,7 @@ class Phase2Config(Schema):
     rounds: Positive = 8
     """Rounds of real episodes of each member."""
     max_rounds: Positive = 9
-    """Rounds of a member whose best self-play score stays below `target_score`."""
+    """Rounds of a member whose best self-play score stays below `target_score`, if that is more than `rounds`."""
     entropy: Weight | None = None
     """Weight of a later member's entropy at the start; null: `agent.entropy`."""
     discount: Fraction | None = None
@@ -317,7 +318,8 @@ class Phase2Config(Schema):
     target_score: Number = 8.0
     """Self-play score below which a member gets further rounds, up to `max_rounds`."""
     max_steps: Positive | None = None
-    """Environment steps, SP and XP, of each member, if they end before its rounds; null: no such bound."""
+    """Environment steps, SP and XP, of each member, if they end before its rounds, of which they must hold one; null:
+    no such bound."""
     plateau: NonNegative = 0
     """A member goes on after `rounds`, until so many rounds were no better than its best, to `max_rounds` at most;
     0: it goes on only while its self-play is below the target."""
@@ -333,6 +335,11 @@ class Phase2Config(Schema):
     """Steps before a major event within which such a start lies."""
     new_fraction: Fraction = 0.5
     """Share of a model batch from a member's own data, half self-play, half cross-play."""
+
+    def cross_play_episodes(self, partners: int) -> int:
+        """Of one round: at least one in each seating with each partner, since every partner's cross-play must be known
+        to tell the strongest; none where members meet nobody."""
+        return max(self.episodes_xp, 2 * partners) if self.episodes_xp else 0
 
     @model_validator(mode="after")
     def _shares_of_starts(self) -> Phase2Config:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Loop, Pending, PlannedPhase, Progress, State, TrainedMember
 from popgen.methods.xpm_wm import phase1, phase2
-from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
+from popgen.methods.xpm_wm.actor_critic import FIT_ROWS, WorldModelPolicy
 from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
 from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
@@ -18,8 +18,9 @@ from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import Weights, same_form
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
 
-ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS = 8e-5, 6.5e-5, 5e-6
-"""On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step."""
+ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS, FIT_SECONDS = 8e-5, 6.5e-5, 5e-6, 1.2e-5
+"""On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step, of an
+action that a partner is fitted to."""
 
 
 def plan_phases(config: WorldModelRun, spec: EnvSpec) -> list[PlannedPhase]:
@@ -37,9 +38,11 @@ def plan_phases(config: WorldModelRun, spec: EnvSpec) -> list[PlannedPhase]:
         PlannedPhase(phase1.SELF_PLAY, FIRST, both, earliest=0.0, side_by_side=overlaps),
     ]
     for member in range(FIRST + 1, config.population.size + 1):
-        most = phase2.most_rounds(two, phase2.cross_play_episodes(two, member - 1), spec.horizon)
+        most = phase2.most_rounds(two, two.cross_play_episodes(member - 1), spec.horizon)
         updates = phase2.count_imagination(two, most)
-        cost = {"model": (most - 1) * two.model_updates * model_update, "agent": updates * together}
+        fits = most * (member - 1) * two.partner_fits * FIT_ROWS * spec.num_players if config.heeds_predecessors else 0
+        imagined = updates * together + fits * FIT_SECONDS  # the agent waits for its partners
+        cost = {"model": (most - 1) * two.model_updates * model_update, "agent": imagined}
         earliest = phase2.count_imagination(two, min(two.rounds, most)) / updates
         beside = overlaps and two.model_lag > 0
         begins = {"model": phase2.count_imagination(two, 1) / updates}  # it learns in each round after the first
@@ -148,7 +151,8 @@ class XpmWmTraining:
 
     def checkpoint(self) -> State:
         """The member's progress, and the state of all workers but the buffers, which the log holds."""
-        return {**self.work.state(), "progress": self.progress.to_state(), "steps": self.progress.steps}
+        own = {"progress": self.progress.to_state(), "steps": self.progress.steps, "seconds": time.time() - self.began}
+        return {**self.work.state(), **own}
 
     def buffers(self) -> State:
         """Both buffers whole."""
@@ -161,6 +165,7 @@ class XpmWmTraining:
             LookupError, TypeError, ValueError: a part is missing or does not fit.
         """
         state, steps = checkpoint.state["progress"], int(checkpoint.state["steps"])
+        self.began -= float(checkpoint.state.get("seconds", 0.0))  # an earlier version did not keep them
         self.work.restore(checkpoint)
         form = self.work.published_form()
         if self.member == FIRST:

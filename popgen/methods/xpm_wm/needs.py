@@ -91,14 +91,19 @@ def _check_view(config: WorldModelRun, spec: EnvSpec) -> None:
 
 
 def _check_lengths(config: WorldModelRun, spec: EnvSpec) -> None:
-    window, phase = config.world_model.length + OPEN_LOOP, config.phase2
+    window, phase, size = config.world_model.length + OPEN_LOOP, config.phase2, config.population.size
     if window > spec.horizon:
         problem = f"windows of {window} steps ({OPEN_LOOP} of them open loop) do not fit an episode of {spec.name}"
         raise UserError("world_model.length", f"{problem} ({spec.horizon})", "shorten them")
-    added = max(phase.episodes_sp, phase.episodes_xp) * (spec.horizon + 1)
+    episodes_xp = phase.cross_play_episodes(size - 1)
+    added = max(phase.episodes_sp, episodes_xp) * (spec.horizon + 1)
     if config.replay.capacity < added:
         problem = f"cannot hold the {added:,} steps that phase2 adds at once"
         raise UserError("replay.capacity", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
+    one = (phase.episodes_sp + episodes_xp) * spec.horizon
+    if size > 1 and phase.max_steps is not None and phase.max_steps < one:
+        problem = f"is less than the {one:,} steps that a round of member {size} takes"
+        raise UserError("phase2.max_steps", problem, "raise it or lower phase2.episodes_sp and episodes_xp")
 
 
 def _check_discovery(config: WorldModelRun, spec: EnvSpec) -> None:

@@ -91,12 +91,6 @@ def count_imagination(phase: Phase2Config, rounds: int) -> int:
     return phase.first_updates + (rounds - 1) * phase.updates_per_round if rounds else 0
 
 
-def cross_play_episodes(phase: Phase2Config, partners: int) -> int:
-    """Of one round: at least one in each seating with each partner, since every partner's cross-play must be known to
-    tell the strongest; none where members meet nobody."""
-    return max(phase.episodes_xp, 2 * partners) if phase.episodes_xp else 0
-
-
 def most_rounds(phase: Phase2Config, episodes_xp: int, horizon: int) -> int:
     """Rounds of real episodes at most: those configured, fewer where the environment steps end first."""
     most, each = max(phase.rounds, phase.max_rounds), (phase.episodes_sp + episodes_xp) * horizon

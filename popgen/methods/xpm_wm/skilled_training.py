@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
-from popgen.methods.training import TrainedMember
+from popgen.methods.training import PlannedPhase, TrainedMember
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
@@ -26,6 +26,10 @@ class FcpWmTraining(XpmWmTraining):
     def first_of_group(self, member: int) -> int:
         """The initial member of the seed that `member` is of; member 1 is alone."""
         return member if member == FIRST else member - (member - FIRST - 1) % len(SKILLS)
+
+    def plan(self) -> list[PlannedPhase]:
+        """A seed trains its final member alone."""
+        return [phase for phase in super().plan() if (phase.member - FIRST) % len(SKILLS) == 0]
 
     def begin(self, first: int) -> tuple[int, ...]:
         """A fresh agent, which becomes the final member of its seed; the others are kept on the way."""

@@ -187,7 +187,7 @@ class LaterMember:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
         self.member, self.archive = setup.member, setup.archive
         self.phase, self.progress, self.tally = self.config.phase2, progress, setup.tally
-        self.episodes_xp = phase2.cross_play_episodes(self.phase, len(self.archive))
+        self.episodes_xp = self.phase.cross_play_episodes(len(self.archive))
         self.pairs = real.seatings(self.member, sorted(self.archive)) if self.episodes_xp else []
         self.most_rounds = phase2.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
         self.imagined: dict[str, float] = {}
