@@ -158,6 +158,12 @@ def test_layout_files_are_read_never_run(tmp_path):
         with pytest.raises(UserError) as caught:
             OvercookedEnv(str(path))
         assert "\n" not in str(caught.value)
+    told = {"['X']": "it is no dict", "{'grid': 5}": "it has no 'grid' of text", "{'n': 2**9}": "no literal"}
+    for text, reason in told.items():
+        path.write_text(text)
+        with pytest.raises(UserError, match=f": {reason}") as caught:
+            OvercookedEnv(str(path))
+        assert "object" not in str(caught.value), "an address in memory tells nobody anything"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError):
         OvercookedEnv(str(path))

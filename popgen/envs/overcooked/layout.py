@@ -151,8 +151,8 @@ def _from_file(layout: str) -> Layout:
         raise UserError("env.layout", f"unknown layout {layout!r}", fix)
     try:
         config = _parse_literal(path.read_text())
-        rows = _split_rows(config.pop("grid"))
-    except (OSError, SyntaxError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        rows = _split_rows(_take_grid(config))
+    except (OSError, SyntaxError, ValueError, TypeError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         fix = "write a dict with a 'grid', of Python's literals"
         raise UserError("env.layout", f"cannot read {path.name}: {reason}", fix) from None
@@ -182,7 +182,23 @@ def _parse_literal(text: str) -> Any:
         if isinstance(node, ast.Name) and node.id != "float":
             hint = f", write {_JSON_WORDS[node.id]}" if node.id in _JSON_WORDS else " is no literal"
             raise ValueError(f"line {node.lineno}: {node.id}{hint}")
-    return ast.literal_eval(_Infinities().visit(tree))
+    try:
+        return ast.literal_eval(_Infinities().visit(tree))
+    except ValueError as error:  # Python's own words end with the node's address in memory
+        raise ValueError(str(error).partition(": <")[0].replace("malformed node or string", "no literal")) from None
+
+
+def _take_grid(config: Any) -> str:
+    """The grid, taken out of a layout file's value; the rules are left.
+
+    Raises:
+        ValueError: the value is no dict, or has no text as its grid.
+    """
+    if not isinstance(config, dict):
+        raise ValueError("it is no dict")
+    if not isinstance(grid := config.pop("grid", None), str):
+        raise ValueError("it has no 'grid' of text")
+    return grid
 
 
 def _split_rows(text: str) -> tuple[str, ...]:
