@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
 
 ALIASES = {"seed": "run.seed"}
-OPEN_SECTIONS = ("env.params", "cluster.resources")  # dictionaries that take any key
+OPEN_SECTIONS = ("env.params", "cluster.resources", "discovery.event_factors")  # dictionaries that take any key
 
 
 QUOTES = "'\""

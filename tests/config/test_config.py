@@ -107,6 +107,11 @@ def test_a_later_member_has_member_1s_settings_unless_it_has_its_own(name: str) 
     assert same.agent_of(2) == same.agent
 
 
+def test_a_dictionary_of_events_takes_any_event_by_its_dotted_name() -> None:
+    discovery = parsed("discovery.event_factors.takes_dish=0.5").discovery
+    assert discovery.event_factors == {"takes_dish": 0.5}
+
+
 def test_overrides_win_over_the_papers_table() -> None:
     config = parsed("scale=paper", "agent.lambda_xp=0.5", "phase1.max_steps=1000")
     assert (config.agent.lambda_xp, config.phase1.max_steps) == (0.5, 1000)
