@@ -171,9 +171,7 @@ def test_what_an_earlier_record_tells_is_not_made_again(run: Run, training: Trai
 def test_a_record_of_other_settings_tells_nothing(run: Run, training: Training, tmp_path: Path, change: str) -> None:
     assert run("reproduce", "wall-clock", *SMALL, "--publish", "kept")[0] == 0
     shutil.rmtree(tmp_path / "out")
-    code, out, _ = run(
-        "reproduce", "wall-clock", *SMALL, *change.split(), "--records", "kept", "--dry-run", "--json"
-    )
+    code, out, _ = run("reproduce", "wall-clock", *SMALL, *change.split(), "--records", "kept", "--dry-run", "--json")
     done = json.loads(out)["targets"][0]["runs_done"]
     assert code == 0 and done == (3 if "kl_predecessors" in change else 0), "only XPM-WM has that setting"
 
