@@ -17,7 +17,7 @@ from popgen.evaluation.holdout import SEATS, HoldoutResult
 from popgen.evaluation.holdout_metrics import (
     Interval,
     Spread,
-    bootstrap_interval,
+    bootstrap_units,
     describe_spread,
     interquartile_mean,
     measure_br_proximity,
@@ -58,7 +58,7 @@ class Standing:
         ego, partners: labels; `partners` of a group, or of a set of groups.
         count: partners.
         score: mean, SD over episodes and SE of the mean (SD over the root of all episodes, as in the paper).
-        interval: of the mean: over the ego's seeds, or over partners and seats where it has one seed.
+        interval: of the mean: over the ego's seeds, or over partners where it has one seed; NaN for one of each.
         seats: mean by the ego's seat.
         worst: the lowest pair.
         cvar: mean of the lowest quarter of pair means.
@@ -84,7 +84,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Margin:
-    """How much more an ego scores than a control with the same partners and seats, with its interval over these."""
+    """How much more an ego scores than a control with the same partners and seats, with its interval over partners."""
 
     ego: str
     control: str
@@ -151,9 +151,8 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
 
 
 def _bound_figure(values: np.ndarray, estimate: Callable[[np.ndarray], float] = interquartile_mean) -> Interval:
-    """Interval of a figure of (runs, K, 2): over runs within each task, or over tasks where there is one run."""
-    flat = values.reshape(len(values), -1)
-    return bootstrap_interval(flat, estimate, over_tasks=len(flat) == 1, repetitions=REPETITIONS)
+    """Interval of a figure of (runs, K, 2): over whole runs, or where there is one over partners with both seats."""
+    return bootstrap_units(values if len(values) > 1 else values[0], estimate, repetitions=REPETITIONS)
 
 
 def _find_worst_pair(result: HoldoutResult, rows: Sequence[int], columns: Sequence[int]) -> Worst:

@@ -32,7 +32,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Interval:
-    """A point estimate with its bootstrap interval."""
+    """A point estimate with its bootstrap interval, whose ends are NaN where there is none."""
 
     value: float
     low: float
@@ -81,11 +81,6 @@ def measure_regret(means: np.ndarray, best: np.ndarray) -> np.ndarray:
     return best - means
 
 
-def find_worst(means: np.ndarray) -> np.ndarray:
-    """(E,) the lowest mean score over partners and seats of (E, K, P)."""
-    return np.asarray(means, np.float64).min(axis=(1, 2))
-
-
 def measure_cvar(values: np.ndarray, share: float = 0.2) -> float:
     """Mean of the lowest `share` of the values, at least one; the last one counts by the part that belongs to it."""
     if not 0.0 < share <= 1.0:
@@ -121,7 +116,8 @@ def bootstrap_interval(
     """An estimate over (runs, tasks) with its stratified percentile bootstrap interval.
 
     Args:
-        scores: (R, T): R seeds of an ego, T pairs of partner and seat. Runs are resampled within each task.
+        scores: (R, T): R independent samples of each of T tasks. They are resampled within each task; see
+            `bootstrap_units` for samples that belong together from task to task.
         estimate: scores -> figure.
         over_tasks: resample the tasks too, for a statement about other partners; the only choice with one run.
         repetitions, level, seed: of the bootstrap.
@@ -138,6 +134,37 @@ def bootstrap_interval(
     estimates = [estimate(_resample(scores, over_tasks, rng)) for _ in range(repetitions)]
     low, high = np.quantile(estimates, [(1.0 - level) / 2.0, (1.0 + level) / 2.0])
     return Interval(float(estimate(scores)), float(low), float(high))
+
+
+def bootstrap_units(
+    values: np.ndarray, estimate: Callable[[np.ndarray], float], *, repetitions: int = 2000
+) -> Interval:
+    """An estimate with its 95 % percentile bootstrap interval over independent units, each drawn with all that it has.
+
+    What one policy scores beside many others is not independent: a strong one is strong beside all of them. Drawn anew
+    for each of them, as `bootstrap_interval` draws runs, these scores would give an interval that is far too narrow.
+
+    Args:
+        values: (U, ...), one row for each of U units, such as the seeds of an ego, or partners with both their seats.
+        estimate: values -> figure.
+        repetitions: of the bootstrap.
+
+    Returns:
+        The figure of all; low and high are NaN for one unit, which tells nothing of others.
+
+    Raises:
+        ValueError: there are no values.
+    """
+    values = np.asarray(values, np.float64)
+    if not values.size:
+        raise ValueError(f"values: there are none in shape {values.shape}")
+    figure, units = float(estimate(values)), len(values)
+    if units == 1:
+        return Interval(figure, math.nan, math.nan)
+    rng = np.random.default_rng(0)
+    drawn = [estimate(values[rng.integers(units, size=units)]) for _ in range(repetitions)]
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Interval(figure, float(low), float(high))
 
 
 def _resample(scores: np.ndarray, over_tasks: bool, rng: np.random.Generator) -> np.ndarray:

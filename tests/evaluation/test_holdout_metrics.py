@@ -9,8 +9,8 @@ import pytest
 
 from popgen.evaluation.holdout_metrics import (
     bootstrap_interval,
+    bootstrap_units,
     describe_spread,
-    find_worst,
     interquartile_mean,
     measure_br_proximity,
     measure_cvar,
@@ -35,9 +35,8 @@ def test_br_prox_clipped_and_not() -> None:
     assert unclipped[0, 1, 0] == 1.5 and math.isnan(unclipped[0, 1, 1])
 
 
-def test_regret_worst_and_normalised_return() -> None:
+def test_regret_and_normalised_return() -> None:
     assert measure_regret(MEANS, BEST).tolist() == [[[2.0, 4.0], [-3.0, 0.0]]]
-    assert find_worst(MEANS).tolist() == [0.0]
     assert normalise_returns(MEANS, 1.0, np.array([[5.0, 5.0], [5.0, 5.0]])).tolist() == [[[0.25, 0.75], [2.0, -0.25]]]
     with pytest.raises(ValueError, match="above low"):
         normalise_returns(MEANS, 0.0, BEST)
@@ -78,6 +77,28 @@ def test_runs_are_resampled_within_tasks() -> None:
     assert (fixed.low, fixed.value, fixed.high) == (35.0, 35.0, 35.0)
     free = bootstrap_interval(scores, lambda sample: float(sample.mean()), over_tasks=True)
     assert free.low < 30 and free.high > 40
+
+
+def test_units_are_drawn_with_all_that_they_have() -> None:
+    """Two seeds, one 4 better beside each of 50 partners: half of all draws of two are of one seed alone."""
+    scores = np.stack([np.full(100, 3.0), np.full(100, 7.0)])
+    together = bootstrap_units(scores, lambda drawn: float(drawn.mean()))
+    assert (together.value, together.low, together.high) == (5.0, 3.0, 7.0)
+    assert bootstrap_units(scores, interquartile_mean) == bootstrap_units(scores, interquartile_mean)
+    alone = bootstrap_units(scores[:1], interquartile_mean)
+    assert alone.value == 3.0 and math.isnan(alone.low) and math.isnan(alone.high)
+    with pytest.raises(ValueError, match="none"):
+        bootstrap_units(np.zeros((0, 3)), interquartile_mean)
+
+
+def test_intervals_of_units_hold_the_truth_about_as_often_as_they_say() -> None:
+    """Each of 32 partners has a level of its own in both seats: seats drawn apart hold the mean far less often."""
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(200):
+        levels = rng.normal(5.0, 1.0, (32, 1)) + rng.normal(0.0, 0.1, (32, 2))
+        found = bootstrap_units(levels, lambda drawn: float(drawn.mean()), repetitions=200)
+        held += found.low <= 5.0 <= found.high
+    assert 0.9 <= held / 200 <= 0.98
 
 
 def test_one_run_has_no_interval_over_runs() -> None:

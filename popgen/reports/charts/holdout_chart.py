@@ -34,7 +34,7 @@ def draw_standings(report: Mapping[str, Any], paths: Sequence[str | Path]) -> No
             places = np.array([n for n, name in enumerate(sets) if name in rows]) + (number + 0.5) * width - 0.4
             chosen = [rows[name] for name in sets if name in rows]
             means = np.array([one["mean"] for one in chosen])
-            reach = np.array([[one["interval"][end] for one in chosen] for end in ("low", "high")])
+            reach = np.array([[one["interval"][end] for one in chosen] for end in ("low", "high")], float)
             colour = COLOURS[number % len(COLOURS)]
             axes.bar(places, means, width, color=colour)
             axes.errorbar(places, means, np.abs(reach - means), fmt="none", ecolor="black", elinewidth=0.8, capsize=2)
