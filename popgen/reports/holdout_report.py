@@ -14,10 +14,11 @@ Keys of the JSON object (`holdout.json`); null stands for what is unknown:
     controls                 egos: ego, alone, beside random and idle; partners: alone, beside random and idle
                              (mean, sd, se)
     margins                  ego, control, partners, gain (value, low, high)
-    reference                best response known to each partner: partner, member, seat_0, seat_1, of (`self-play` or
-                             `best response`, by seat)
+    reference                best response known to each partner: partner, member, source, seat_0, seat_1, of
+                             (`self-play` or `best response`, by seat)
     paper                    holdout, ego, mean, spread: the paper's table of the layout
-    pairs                    ego, member, partner, partner_member, seat (of the ego), mean, sd, se, scores
+    pairs                    ego, member, ego_source, partner, partner_member, partner_source (populations' folders or
+                             module:Agent: one label may have several), seat (of the ego), mean, sd, se, scores
     notes                    what a reader must know, in sentences
 """
 
@@ -43,6 +44,7 @@ from popgen.reports.paper_ego_figures import list_cells
 CSV_FIELDS = (
     *("ego", "ego_member", "partner", "partner_member", "seat"),
     *("mean", "sd", "se", "episodes", "reference", "br_prox", "br_prox_clipped", "regret"),
+    *("ego_source", "partner_source"),
 )
 """Columns of holdout.csv: one row for each pair and seat of the ego."""
 
@@ -124,7 +126,7 @@ def _list_references(result: HoldoutResult) -> Iterator[dict[str, Any]]:
     for n, player in enumerate(result.casting.partner_players):
         of = ["best response" if trained[n, seat] >= references[n, seat] else "self-play" for seat in SEATS]
         seats = {f"seat_{seat}": references[n, seat] for seat in SEATS}
-        yield {"partner": player.group, "member": player.member, **seats, "of": of}
+        yield {"partner": player.group, "member": player.member, "source": player.source, **seats, "of": of}
 
 
 def _list_pairs(result: HoldoutResult) -> Iterator[dict[str, Any]]:
@@ -132,9 +134,9 @@ def _list_pairs(result: HoldoutResult) -> Iterator[dict[str, Any]]:
     for r, ego in enumerate(casting.ego_players):
         for k, partner in enumerate(casting.partner_players):
             for seat in SEATS:
-                names = {"ego": ego.group, "member": ego.member, "partner": partner.group}
+                names = {"ego": ego.group, "member": ego.member, "ego_source": ego.source, "partner": partner.group}
                 scores = result.scores[r, k, seat]
-                where = {"partner_member": partner.member, "seat": seat}
+                where = {"partner_member": partner.member, "partner_source": partner.source, "seat": seat}
                 yield {**names, **where, **_describe_scores(scores), "scores": scores.tolist()}
 
 
@@ -143,8 +145,8 @@ def _write_notes(result: HoldoutResult) -> list[str]:
     trained = int(np.isfinite(result.responses).all((1, 2)).sum())
     total = len(casting.partner_players)
     notes = [
-        "SD is over episodes, SE = SD / sqrt(episodes); intervals (95 %) are over an ego's seeds, or over partners and "
-        "seats where it has one seed.",
+        "SD is over episodes, SE = SD / sqrt(episodes); intervals (95 %) are over an ego's seeds, or over partners "
+        "where it has one seed. Those over few seeds are too narrow.",
         f"BR-Prox divides by the best response known: a trained one for {trained} of {total} partners, else the "
         "partner with itself; where a trained one scores less than that, the partner with itself.",
     ]
@@ -160,10 +162,10 @@ def _write_notes(result: HoldoutResult) -> list[str]:
 
 def to_csv_text(report: Mapping[str, Any]) -> str:
     """One row for each pair and seat of the ego."""
-    known = {(one["partner"], one["member"]): one for one in report["reference"]}
+    known = {(one["partner"], one["source"], one["member"]): one for one in report["reference"]}
     rows = []
     for pair in report["pairs"]:
-        best = known[pair["partner"], pair["partner_member"]][f"seat_{pair['seat']}"]
+        best = known[pair["partner"], pair["partner_source"], pair["partner_member"]][f"seat_{pair['seat']}"]
         ratio = pair["mean"] / best if best and best > 0 else None
         figures = {"reference": best, "br_prox": ratio, "br_prox_clipped": 1.0 if ratio is None else min(1.0, ratio)}
         more = {"ego_member": pair["member"], "episodes": report["episodes"], "regret": best - pair["mean"]}

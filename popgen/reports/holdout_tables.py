@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from popgen.evaluation.holdout_figures import ALL, CROSS, OWN
-from popgen.reports.frames import UNKNOWN, Sheet, number_text
+from popgen.reports.frames import UNKNOWN, Sheet, estimate_text, number_text
 from popgen.reports.method_titles import title_of
 from popgen.reports.paper_ego_figures import AVERAGES, EGOS, average_by_method
 
@@ -92,7 +92,8 @@ def _make_control_sheet(report: Mapping[str, Any]) -> Sheet:
     cells = []
     for kind, rows in (("ego", report["controls"]["egos"]), ("partner", report["controls"]["partners"])):
         for row in rows:
-            figures = {name: f"{row[key]['mean']:.2f} ± {row[key]['se'] or 0:.2f}" for name, key in _CONTROLS.items()}
+            found = {name: {**row[key], "standard_error": row[key]["se"]} for name, key in _CONTROLS.items()}
+            figures = {name: estimate_text(figure) for name, figure in found.items()}
             cells.append({"who": f"{kind} {title_of(row[kind])}", **figures})
     return Sheet("controls: mean ± SE", pd.DataFrame(cells))
 
@@ -106,11 +107,16 @@ def _make_margin_sheet(report: Mapping[str, Any]) -> Sheet:
             "ego": one["ego"],
             "beside": title_of(one["partners"]),
             "gain": f"{one['gain']['value']:+.2f}",
-            "95 %": f"{one['gain']['low']:+.2f} to {one['gain']['high']:+.2f}",
+            "95 %": _show_ends(one["gain"]),
         }
         for one in report["margins"]
     ]
     return Sheet(f"more than the control {report['margins'][0]['control']}", pd.DataFrame(cells), labels=2)
+
+
+def _show_ends(gain: Mapping[str, float | None]) -> str:
+    low, high = gain["low"], gain["high"]
+    return UNKNOWN if low is None or high is None else f"{low:+.2f} to {high:+.2f}"
 
 
 def _make_paper_sheet(report: Mapping[str, Any]) -> Sheet:
