@@ -93,6 +93,8 @@ def evaluate(args: argparse.Namespace) -> int:
             without = "without" if together else "with"
             option = f"--{name.replace('_', '-')}"
             raise UserError(option, f"is of an evaluation {without} --with", "leave it out")
+    if args.response_set and not args.best_responses:
+        raise UserError("--response-set", "is of best responses, and none are trained", "add --best-responses")
     if together:
         return _evaluate_egos(args)
     if len(args.populations) > 1:

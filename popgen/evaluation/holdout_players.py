@@ -22,6 +22,9 @@ from popgen.population import Population, load_population
 from popgen.population.files import digest, to_tensors
 from popgen.population.manifest import EnvironmentInfo
 
+EGO = "ego"
+"""The side of egos; all others are of partners."""
+
 TRAINED_WITH = "trained_with"
 """Key in a member's `extra` under which an ego's training partners stand."""
 
@@ -120,8 +123,8 @@ def open_sides(wanted: Mapping[str, Sequence[tuple[str | None, str]]], title: Ca
         title: a method's name -> label of populations that were given none.
 
     Raises:
-        UserError: what cannot be loaded, an empty population, one given twice, none at all, two of different
-            environments, or one label on two sides of partners.
+        UserError: what cannot be loaded, an empty population, one given twice among egos or among partners, none at
+            all, two of different environments, or one label on two sides of partners.
     """
     populations: dict[str, Population] = {}
     for source in (source for named in wanted.values() for _, source in named):
@@ -146,7 +149,24 @@ def open_sides(wanted: Mapping[str, Sequence[tuple[str | None, str]]], title: Ca
                 group = _describe_agent(label or source.rpartition(":")[2], source, rules)
             found[group.label] = _join_groups(found[group.label], group) if group.label in found else group
         sides[side] = tuple(found.values())
+    _check_groups(sides)
     return Sides(sides, environment)
+
+
+def _check_groups(sides: Mapping[str, Sequence[Group]]) -> None:
+    """A population counts once among egos and once among partners, and a label of partners has one side."""
+    labels: dict[str, str] = {}
+    places: set[tuple[bool, str]] = set()
+    for side, groups in sides.items():
+        for group in groups:
+            if side != EGO and labels.setdefault(group.label, side) != side:
+                problem = f"is on two sides, {labels[group.label]} and {side}"
+                raise UserError(group.label, problem, "give them different names: NAME=POPULATION")
+            for source in dict.fromkeys(player.source for player in group.players):
+                place = (side == EGO, source if is_agent_name(source) else str(Path(source).resolve()))
+                if place in places:
+                    raise UserError(source, "is given twice", "give each once")
+                places.add(place)
 
 
 def _check_environment(population: Population, environment: EnvironmentInfo) -> None:

@@ -54,6 +54,21 @@ def test_responses_are_trained_once_and_played(run: Run, tmp_path: Path) -> None
         find_response(runs[0].parent, digest)
 
 
+def test_one_population_counts_once_and_one_label_of_partners_has_one_side(run: Run, tmp_path: Path) -> None:
+    ego, held = population(tmp_path / "ego", "mappo", 1, 1), population(tmp_path / "held", "lipo", 2, 2)
+    other = population(tmp_path / "other", "lipo", 3, 3)
+    for words, told in (
+        ((str(ego), "--with", f"a={held}", f"b={tmp_path / 'ego' / '..' / 'held'}"), "is given twice"),
+        ((str(ego), "--with", f"a={held}", "--human", f"b={held}"), "is given twice"),
+        ((f"a={ego}", f"b={ego}", "--with", str(held)), "is given twice"),
+        ((str(ego), "--with", f"same={held}", "--human", f"same={other}"), "same: is on two sides, partner and human"),
+        ((str(ego), "--with", str(held), "--response-set", "scale=smoke"), "add --best-responses"),
+    ):
+        code, _, err = run("evaluate", *words, "--episodes", "1", "--out", str(tmp_path / "out"), "--quiet")
+        assert code == 2 and told in err and len(err.splitlines()) == 1, err
+    assert len(open_sides({"ego": [("a", str(ego))], "partner": [("a", str(held))]}, str).sides) == 2
+
+
 def test_diversity_is_printed_and_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
     held = population(tmp_path / "held", "lipo", 2, 2, 3)
     code, out, err = run("diversity", str(held), "--episodes", "1", "--choose", "1")
