@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from popgen.envs.overcooked.transition_events import EVENTS
+from popgen.evaluation.estimates import adjust_by_holm
 from popgen.evaluation.played_games import PlayedGame
 
 BEHAVIOURS: Mapping[str, tuple[str, ...]] = {
@@ -144,12 +145,9 @@ def _measure_effect(samples: Samples, inside: np.ndarray, name: str, group: str)
 
 def correct_by_holm(effects: Sequence[Effect]) -> list[Effect]:
     """Holm's step-down correction over all effects that could be measured."""
-    measured = sorted((effect.p, index) for index, effect in enumerate(effects) if np.isfinite(effect.p))
-    corrected, running = list(effects), 0.0
-    for rank, (p, index) in enumerate(measured):
-        running = max(running, min(1.0, p * (len(measured) - rank)))
-        corrected[index] = replace(effects[index], p_holm=running)
-    return corrected
+    measured = [effect for effect in effects if np.isfinite(effect.p)]
+    values = iter(adjust_by_holm([effect.p for effect in measured]))
+    return [replace(effect, p_holm=next(values)) if np.isfinite(effect.p) else effect for effect in effects]
 
 
 def tabulate_effects(games: Sequence[PlayedGame], threshold: float, *, pooled: bool = False) -> list[Effect]:

@@ -153,7 +153,8 @@ class CrossPlayResult:
                 for partner in PARTNERS if i != j else ():
                     for member, beside in ((i, self.score(i, partner)), (j, self.score(partner, j))):
                         xp = self.score(i, j)
-                        found.append(Obstruction((i, j), partner, member, xp, beside, xp.chance_below(beside)))
+                        chance = xp.chance_below(beside, self.episodes)
+                        found.append(Obstruction((i, j), partner, member, xp, beside, chance))
         adjusted = adjust_by_holm([one.p_value for one in found])
         return tuple(replace(one, p_value=value) for one, value in zip(found, adjusted, strict=True))
 
@@ -173,9 +174,13 @@ class CrossPlayResult:
         """What remains of a member's self-play after cross-play in which it had `seat`: mean over its partners.
 
         NaN where it has none, or where its self-play scores nothing. `reset`: with its memory forgotten at the switch.
+        The shares have one ordinary self-play in common, whose error no number of partners averages out.
         """
-        shares = [one.share(reset=reset) for one in self.mixed if (one.member, one.seat) == (member, seat)]
-        return Estimate.average([share for share in shares if math.isfinite(share.mean)])
+        plays = [one for one in self.mixed if (one.member, one.seat) == (member, seat)]
+        if not plays:
+            return Estimate(math.nan, math.nan)
+        after = Estimate.average([one.reset if reset else one.kept for one in plays])
+        return after.divide(plays[0].ordinary)
 
     @property
     def obstruction(self) -> dict[str, bool]:

@@ -45,14 +45,22 @@ class Estimate:
         """Lower than `other` by more than two standard errors of the difference; never where these are unknown."""
         return self.mean < other.mean - 2 * math.hypot(self.error, other.error)
 
-    def chance_below(self, other: Estimate) -> float:
-        """One-sided p-value of being lower than `other` (normal approximation); NaN without errors to judge by."""
+    def chance_below(self, other: Estimate, samples: int) -> float:
+        """One-sided p-value of being lower than `other` by Welch's t, both means of so many samples; NaN of one sample.
+
+        It is never less than the share of the best of all ways to deal the 2 N samples out to the two: samples that
+        happen to be equal have no spread, and would prove anything.
+        """
+        from scipy.special import stdtr
+
         error, difference = math.hypot(self.error, other.error), self.mean - other.mean
-        if not math.isfinite(error) or not math.isfinite(difference):
+        if samples < 2 or not math.isfinite(error) or not math.isfinite(difference):
             return math.nan
+        least = 1 / math.comb(2 * samples, samples)
         if error == 0.0:
-            return 0.0 if difference < 0.0 else 1.0
-        return 0.5 * math.erfc(-difference / error / math.sqrt(2.0))
+            return least if difference < 0.0 else 1.0
+        degrees = (samples - 1) / ((self.error / error) ** 4 + (other.error / error) ** 4)
+        return max(least, float(stdtr(degrees, difference / error)))
 
     def divide(self, other: Estimate) -> Estimate:
         """Ratio of two independent estimates, error by the delta method; NaN where `other` is not above 0."""
@@ -60,6 +68,20 @@ class Estimate:
             return Estimate(math.nan, math.nan)
         ratio = self.mean / other.mean
         return Estimate(ratio, math.hypot(self.error, ratio * other.error) / other.mean)
+
+
+def measure_half_interval(samples: Sequence[float] | np.ndarray) -> float:
+    """Half of the 95 % interval of the mean of independent samples (N,), by Student's t, which takes them as normal.
+
+    NaN for fewer than two. A percentile bootstrap of so few, between their extremes, would hold the mean of two half
+    of the time and that of three three times in four.
+    """
+    from scipy.special import stdtrit
+
+    count = len(samples)
+    if count < 2:
+        return math.nan
+    return float(stdtrit(count - 1, 0.975)) * float(np.std(samples, ddof=1)) / math.sqrt(count)
 
 
 def adjust_by_holm(p_values: Sequence[float]) -> list[float]:

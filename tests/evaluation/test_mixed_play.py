@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from support.scripted import HORIZON, ONE, QUIT, STAY, TWO, Cast, Script, TallyE
 
 from popgen.evaluation.crossplay import CrossPlayResult, evaluate_population
 from popgen.evaluation.estimates import Estimate, adjust_by_holm
-from popgen.evaluation.mixed_play import Switch, play_mixed, play_switches
+from popgen.evaluation.mixed_play import MixedPlay, Switch, play_mixed, play_switches
 from popgen.reports.crossplay_report import list_warnings, mixed_play_sheet, summary, to_dict
 
 
@@ -111,17 +112,45 @@ def test_holm_by_hand() -> None:
 
 
 def test_chances_by_hand() -> None:
-    # A difference of 1.96 errors has 0.025 below it.
-    assert Estimate(0.0, 3.0).chance_below(Estimate(1.96 * 5, 4.0)) == pytest.approx(0.025, abs=1e-4)
-    assert Estimate(1.0, 0.0).chance_below(Estimate(2.0, 0.0)) == 0.0
-    assert Estimate(2.0, 0.0).chance_below(Estimate(2.0, 0.0)) == 1.0
-    assert math.isnan(Estimate(1.0, math.nan).chance_below(Estimate(2.0, 0.1)))
+    # A difference of 1.96 errors has 0.025 below it; of few samples more (t of 2 degrees below -4.303: 0.025).
+    assert Estimate(0.0, 3.0).chance_below(Estimate(1.96 * 5, 4.0), 10_000) == pytest.approx(0.025, abs=1e-4)
+    assert Estimate(0.0, 0.0).chance_below(Estimate(4.3027, 1.0), 3) == pytest.approx(1 / 20)  # 20 ways to deal six
+    assert Estimate(0.0, 1.0).chance_below(Estimate(2.2281 * 2**0.5, 1.0), 6) == pytest.approx(0.025, abs=1e-4)
+    assert Estimate(1.0, 0.0).chance_below(Estimate(2.0, 0.0), 2) == pytest.approx(1 / 6)  # {1, 1} of {1, 1, 2, 2}
+    assert Estimate(2.0, 0.0).chance_below(Estimate(2.0, 0.0), 2) == 1.0
+    assert math.isnan(Estimate(1.0, math.nan).chance_below(Estimate(2.0, 0.1), 1))
+
+
+@pytest.mark.parametrize("samples", [2, 4, 20])
+def test_chance_below_is_rarely_small_where_nothing_is(samples: int) -> None:
+    """Scores that are few and whole numbers are often equal by chance; two errors are no proof then."""
+    rng = np.random.default_rng(samples)
+    draws = rng.binomial(4, 0.6, (4000, 2, samples)).astype(float)
+    chances = np.array([Estimate.of(a).chance_below(Estimate.of(b), samples) for a, b in draws])
+    for level in (0.01, 0.05):
+        assert (chances <= level).mean() <= 1.3 * level
+
+
+def test_shares_of_one_self_play_do_not_average_its_error_out() -> None:
+    """Ten partners after whom exactly 5 of 10 +- 1 remain: a share of 0.5, whose error is that of the 10."""
+    exact, ordinary = Estimate(5.0, 0.0), Estimate(10.0, 1.0)
+    plays = tuple(MixedPlay(1, partner, 0, exact, exact, ordinary) for partner in range(2, 12))
+    got = replace(evaluated(Script([ONE])), mixed=plays).share(1, 0)
+    assert got.mean == 0.5 and got.error == pytest.approx(0.05)
 
 
 def test_a_ratio_has_the_error_of_both() -> None:
     ratio = Estimate(3.0, 0.3).divide(Estimate(4.0, 0.4))
     assert ratio.mean == 0.75 and ratio.error == pytest.approx(0.75 * math.hypot(0.1, 0.1))
     assert math.isnan(Estimate(3.0, 0.3).divide(Estimate(0.0, 0.1)).mean)
+
+
+def test_few_episodes_of_equal_players_prove_no_obstruction() -> None:
+    from popgen.policies.simple_policies import RandomPolicy
+
+    for episodes in (2, 3):
+        members = [RandomPolicy(4, [0.25, 0.375, 0.375, 0.0]) for _ in range(6)]
+        assert evaluated(*members, episodes=episodes).obstructions == ()  # type: ignore[arg-type]
 
 
 def test_eight_equal_players_obstruct_nobody_and_one_episode_judges_nothing() -> None:
