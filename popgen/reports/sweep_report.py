@@ -11,7 +11,7 @@ Keys of the JSON object (`sweep.json`); null stands for what is unknown:
     best                     environment -> label of the largest mean gap
     missing                  runs that did not finish: id and error
 
-Intervals are 95 % percentile bootstraps over seeds, as rliable's (Agarwal et al. 2021); null for one seed.
+Intervals are of 95 % over seeds, by Student's t, which takes seeds as normal; null for one seed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 
 from popgen.errors import UserError
-from popgen.evaluation.holdout_metrics import bootstrap_interval
+from popgen.evaluation.estimates import measure_half_interval
 from popgen.reports.charts.sweep_chart import draw_sweep
 from popgen.reports.frames import Sheet, number_text, range_text, seeds_text, steps_text, to_csv
 from popgen.reports.method_titles import title_of
@@ -105,12 +105,12 @@ def _average_group(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> 
 
 
 def interval_of(values: Sequence[float | None]) -> dict[str, float | None]:
-    """Mean of what is known, with a 95 % bootstrap interval where there are two values or more."""
+    """Mean of what is known, with its 95 % interval where there are two values or more."""
     known = np.array([value for value in values if value is not None], np.float64)
     if len(known) < 2:
         return {"mean": _mean_of(values), "low": None, "high": None}
-    interval = bootstrap_interval(known[:, None], lambda scores: float(scores.mean()))
-    return {"mean": interval.value, "low": interval.low, "high": interval.high}
+    mean, half = float(known.mean()), measure_half_interval(known)
+    return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
 def _mean_of(values: Sequence[float | None]) -> float | None:

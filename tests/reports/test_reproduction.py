@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,16 @@ def test_the_papers_rows_stand_below_ours() -> None:
     assert table.loc["LIPO, paper", "any exit"] == "0.067" and table.loc["LIPO (paper)", "any exit"] == "0.59"
     assert table.loc["XPM-Sim (paper)", "XP"] == "-114.5" and sheet.dim == {1, 2, 3}
     assert "landmarks" not in table.columns  # nobody has that figure
+
+
+def test_a_cell_that_some_seeds_lack_says_so_and_one_seed_has_no_interval() -> None:
+    """Steps until all members pass are known of the seeds where they do: their mean is not that of all seeds."""
+    runs = [sabotage(1, 0.5, -3), sabotage(2, 0.7, -5), run("LIPO, paper", 3, {"sabotage": {"any_exit": 0.9}})]
+    told = record("table1", runs)
+    table = make_sheets(told, TARGETS["table1"])[0].frame.set_index("")
+    assert table.loc["LIPO, paper", "XP"].endswith(" (2 of 3)") and "of" not in table.loc["LIPO, paper", "any exit"]
+    rows = list(csv.DictReader(to_rows_csv(record("table1", runs[:1]), TARGETS["table1"]).splitlines()))
+    assert (rows[0]["XP"], rows[0]["XP low"], rows[0]["XP high"]) == ("-3.0", "", "")
 
 
 def test_csv_has_ours_and_the_papers() -> None:

@@ -9,10 +9,11 @@ from popgen.reports.run_record import read_run
 from popgen.reports.sweep_report import SweptRun, build_report, interval_of, runs_csv, summary, to_sheets, write_report
 
 
-def test_an_interval_lies_between_the_extremes_and_one_seed_has_none() -> None:
+def test_an_interval_is_students_and_one_seed_has_none() -> None:
     interval = interval_of([1.0, 2.0, 6.0])
     assert interval["mean"] == pytest.approx(3.0)
-    assert interval["low"] == pytest.approx(1.0) and interval["high"] == pytest.approx(6.0)  # all three alike: 1 in 27
+    half = 4.3026527 * (14 / 2 / 3) ** 0.5  # t of two degrees; squared deviations 4 + 1 + 9
+    assert interval["low"] == pytest.approx(3.0 - half) and interval["high"] == pytest.approx(3.0 + half)
     assert interval_of([2.0]) == {"mean": 2.0, "low": None, "high": None}
     assert interval_of([None, None]) == {"mean": None, "low": None, "high": None}
     assert interval_of([4.0, 4.0]) == {"mean": 4.0, "low": 4.0, "high": 4.0}
@@ -44,12 +45,12 @@ def test_groups_are_settings_over_their_seeds_and_the_largest_gap_is_the_best(tm
         "MAPPO",
     ]
     assert (first["seeds"], first["sp"]["mean"], first["gap"]["mean"]) == ([1, 2], 11.0, 7.0)
-    assert (second["gap"]["mean"], second["gap"]["low"], second["gap"]["high"]) == (8.5, 8.0, 9.0)
+    assert second["gap"]["mean"] == 8.5 and second["gap"]["high"] == pytest.approx(8.5 + 12.7062 * 0.5)
     assert (first["real_steps"], first["simulated_steps"], third["gap"]["low"]) == (1500, 500, None)
     assert report["best"] == {"overcooked/cramped_room": "XPM-Sim xpm_sim.lambda_xp=0.5"}
     assert summary(report)[-1] == "missing: d1 (the disk is full)"
     (sheet,) = to_sheets(report)
-    assert sheet.frame["SP - XP"].tolist() == ["7.00 (6.00 to 8.00)", "8.50 (8.00 to 9.00)", "1.00"]
+    assert sheet.frame["SP - XP"].tolist() == ["7.00 (-5.71 to 19.71)", "8.50 (2.15 to 14.85)", "1.00"]
     lines = runs_csv(report).splitlines()
     assert lines[0].endswith("seconds,xpm_sim.lambda_xp") and lines[3].startswith("b1,xpm_sim,")
     assert lines[5].endswith(",")  # no such setting

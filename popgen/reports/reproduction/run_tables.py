@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from popgen.evaluation.estimates import measure_half_interval
 from popgen.reports.frames import UNKNOWN, Sheet, to_csv
 from popgen.reports.reproduction.target_records import Column, PaperLine, Record, Target
 
@@ -67,13 +67,8 @@ def take_interval(values: Sequence[float]) -> Interval | None:
     """Of a figure's values, one a seed; None without any."""
     if not len(values):
         return None
-    from scipy.stats import t as student_t
-
-    mean, count = float(np.mean(values)), len(values)
-    if count < 2:
-        return Interval(mean, 0.0, 1)
-    half = float(student_t.ppf(0.975, count - 1)) * float(np.std(values, ddof=1)) / math.sqrt(count)
-    return Interval(mean, half, count)
+    count = len(values)
+    return Interval(float(np.mean(values)), measure_half_interval(values) if count > 1 else 0.0, count)
 
 
 def find_figure(run: Mapping[str, Any], figure: str) -> Any:
@@ -129,6 +124,8 @@ def _our_cells(row: TableRow, columns: Sequence[Column]) -> dict[str, str]:
     for column in columns:
         cell = row.cells[column.title]
         texts[column.title] = UNKNOWN if cell is None else cell.to_text(column.digits)
+        if cell is not None and cell.seeds < len(row.seeds):
+            texts[column.title] += f" ({cell.seeds} of {len(row.seeds)})"
     return {"": row.label, "seeds": ", ".join(map(str, row.seeds)), **texts}
 
 
@@ -154,7 +151,8 @@ def make_run_sheet(record: Record, target: Target) -> Sheet:
 
 
 def to_rows_csv(record: Record, target: Target) -> str:
-    """Our rows and the paper's: source, row, environment, seeds, and mean, low and high of each column."""
+    """Our rows and the paper's: source, row, environment, seeds, and mean, low and high of each column; one seed's
+    figure has no interval."""
     names = [f"{column.title}{end}" for column in target.columns for end in ("", " low", " high")]
     found: list[dict[str, Any]] = []
     for row in summarise_runs(record, target.columns):
@@ -162,7 +160,8 @@ def to_rows_csv(record: Record, target: Target) -> str:
         line["seeds"] = " ".join(map(str, row.seeds))
         for title, cell in row.cells.items():
             if cell is not None:
-                line |= {title: cell.mean, f"{title} low": cell.low, f"{title} high": cell.high}
+                line[title] = cell.mean
+                line |= {f"{title} low": cell.low, f"{title} high": cell.high} if cell.seeds > 1 else {}
         found.append(line)
     for name in list_environments(record):
         found += [
