@@ -14,6 +14,7 @@ builds on: all earlier members, or all members where they learn together.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -138,8 +139,8 @@ def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
             if run.environment.name == first.environment.name:
                 _check_environment(first, run)
     for members in found.values():
-        for run in members[1:]:
-            _check_label(members[0], run)
+        for first, run in itertools.combinations(members, 2):
+            _check_label(first, run)
     order = list(METHODS)
     groups = [Group(label, members[0].method, name, tuple(members)) for (name, label), members in found.items()]
     rank = {label: order.index(label) if label in order else len(order) for _, label in found}

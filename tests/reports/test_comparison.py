@@ -297,6 +297,8 @@ def test_runs_of_one_label_must_be_seeds_of_one_thing(tmp_path: Path, model: Run
     with pytest.raises(UserError, match="with seed 0, like"):
         group_runs([model, read_run(again)])
     assert len(group_runs([model, read_run(again, "other")])) == 2
+    with pytest.raises(UserError, match="again: is .* with seed 0, like .*model"):  # neither is the first
+        group_runs([read_run(seed1), model, read_run(again)])
     weak = finished_run(tmp_path, "weak", [{"SP": 1}], seed=2, settings={"agent": {"lambda_xp": 0.0}})
     with pytest.raises(UserError, match=r"agent.lambda_\w+ is .*; tell them apart with NAME=RUN"):
         group_runs([model, read_run(weak)])
