@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import numpy as np
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
+from popgen.evaluation.holdout_players import NO_WEIGHTS
 from popgen.methods.ego.config import BrRun, EgoRun
 from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
 from popgen.methods.ego.partner_source import PartnerSource
@@ -48,7 +50,7 @@ def read_partner(text: str) -> NamedMembers:
         UserError: no population, or no such member.
     """
     path, _, numbers = text.rpartition(":")
-    if not path or not numbers.replace(",", "").isdigit():
+    if not path or not re.fullmatch(r"[0-9,]*[0-9][0-9,]*", numbers):
         path, numbers = text, ""
     population = load_population(path)
     everyone = range(1, len(population) + 1)
@@ -57,6 +59,8 @@ def read_partner(text: str) -> NamedMembers:
         raise UserError("ego.partners", f"{path} has no member {wrong[0]}", f"it has {len(population)}")
     if not members:
         raise UserError("ego.partners", f"{path} has no members", "choose another population")
+    if len(set(members)) < len(members):
+        raise UserError("ego.partners", f"{text} names a member twice", "name each once")
     data = (population.path / MANIFEST).read_bytes()
     return NamedMembers(population, members, hashlib.sha256(data).hexdigest())
 
@@ -68,13 +72,28 @@ def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:
         UserError: a population that is missing, changed or of another environment.
     """
     named = [read_partner(text) for text in config.ego.partners]
-    for one, text in zip(named, config.ego.partners, strict=True):
+    for one in named:
         check_compatible(one.population, spec)
-        if config.ego.pinned and one.digest not in config.ego.pinned:
-            raise UserError("ego.partners", f"{text} has changed since the run began", "restore it or start a new run")
+    _check_pinned(config, named)
+    digests = [digest for one in describe_partners(named) for digest in one.policy_sha256 if digest != NO_WEIGHTS]
+    if len(set(digests)) < len(digests):
+        problem = "hold a member twice (by the digest of its weights), which would play twice as often as others"
+        raise UserError("ego.partners", problem, "name each once: PATH:1,3")
     if isinstance(config, BrRun) and (count := sum(len(one.members) for one in named)) > 1:
         raise UserError("ego.partners", f"{count} members, but a best response has one partner", "name it: PATH:3")
     return named
+
+
+def _check_pinned(config: EgoRun, named: Sequence[NamedMembers]) -> None:
+    """The populations are those, in their order, with which the run began; one that is not pinned has not begun."""
+    if not (pinned := config.ego.pinned):
+        return
+    if len(pinned) != len(named):
+        problem = f"has {len(pinned)} digests for {len(named)} populations"
+        raise UserError("ego.pinned", problem, "leave it out: popgen ego train fills it in")
+    for one, text, digest in zip(named, config.ego.partners, pinned, strict=True):
+        if one.digest != digest:
+            raise UserError("ego.partners", f"{text} has changed since the run began", "restore it or start a new run")
 
 
 def describe_partners(named: Sequence[NamedMembers]) -> list[PartnerSource]:

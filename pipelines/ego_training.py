@@ -72,6 +72,8 @@ def make_ego_config(
         *sections, last = key.split(".")
         for part in sections:
             section = section.setdefault(part, {})
+            if not isinstance(section, dict):
+                raise UserError(key, f"does not exist: {part} holds no settings", "see popgen config METHOD")
         section[last] = value
     return pin_partners(RunConfig.parse(values))
 

@@ -105,6 +105,11 @@ def test_what_cannot_be_trained_is_told_in_one_line(partners: Path) -> None:
     for method, named, settings, field in (
         ("br", [str(partners)], {}, "ego.partners"),
         ("fcp", [f"{partners}:4"], {}, "ego.partners"),
+        ("fcp", [f"{partners}:1,1"], {}, "ego.partners"),
+        ("fcp", [f"{partners}:1", f"{partners}:1,2"], {}, "ego.partners"),
+        ("sp", [], {"ego.other_starts": 0.5}, "ego.other_starts"),
+        ("sp_aug", [], {"ego.sampling": "prioritised"}, "ego.sampling"),
+        ("fcp", [str(partners)], {"run.seed.deeper": 1}, "run.seed.deeper"),
         ("sp", [str(partners)], {}, "ego.partners"),
         ("hipt", [], {}, "ego.partners"),
         ("mappo", [], {}, "method"),
@@ -121,3 +126,10 @@ def test_partners_that_changed_are_refused(partners: Path, tmp_path: Path, monke
     other = config.ego.model_copy(update={"pinned": ("0" * 64,)})
     with pytest.raises(UserError, match="has changed"):
         launch(tmp_path, "changed", config.model_copy(update={"ego": other}), monkeypatch)
+    both = make_ego_config("fcp", [f"{partners}:1", f"{partners}:2"], SETTINGS, scale="smoke")
+    for number, (pinned, told) in enumerate(
+        ((("0" * 64, both.ego.pinned[0]), "has changed"), (both.ego.pinned[:1], "1 digests for 2"))
+    ):
+        other = both.ego.model_copy(update={"pinned": pinned})
+        with pytest.raises(UserError, match=told):
+            launch(tmp_path, f"changed{number}", both.model_copy(update={"ego": other}), monkeypatch)

@@ -220,7 +220,7 @@ class EgoLearner:
         placed = [torch.zeros(rollout.reward.shape) for _ in range(2)]
         placed[0][step, row] = _normalise(torch.from_numpy(advantage.astype(np.float32)))
         placed[1][step, row] = critic.normalised(returns)
-        figures |= _describe_choices(choices, weight, float(np.mean(paid)))
+        figures |= _describe_choices(choices, levels.skills, weight, float(np.mean(paid)))
         return Targets(*placed)
 
     def _critic(self, level: str) -> ValueNet:
@@ -318,10 +318,10 @@ def _normalise(advantage: Tensor) -> Tensor:
     return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
 
 
-def _describe_choices(choices: Choices, weight: float, paid: float) -> dict[str, float]:
-    """I(z; a), how often each z is chosen, and how much of the high level's reward is influence."""
+def _describe_choices(choices: Choices, skills: int, weight: float, paid: float) -> dict[str, float]:
+    """I(z; a), how often each of all z is chosen, and how much of the high level's reward is influence."""
     drawn = choices.skill[choices.decides]
-    share = torch.bincount(drawn, minlength=2).float() / len(drawn)
+    share = torch.bincount(drawn, minlength=skills).float() / len(drawn)
     influence = float(choices.influence.mean())
     return {
         "influence": influence,

@@ -42,6 +42,16 @@ def _build_networks(config: EgoRun, spec: EnvSpec) -> list[object]:
     return [EgoNet(EgoSetup.of_run(config).sizes, spec), *critics]
 
 
+def _check_alone(config: EgoRun) -> None:
+    """Settings of play beside partners are in vain where there are none."""
+    for name, value, fix in (
+        ("other_starts", config.ego.other_starts, "leave it out; method=sp_aug has augment.share"),
+        ("sampling", "" if config.ego.sampling == "uniform" else config.ego.sampling, "leave it out"),
+    ):
+        if value:
+            raise UserError(f"ego.{name}", f"is of play beside partners, {config.method} plays with itself", fix)
+
+
 def check_run(config: EgoRun, spec: EnvSpec) -> None:
     """Partners, unless the ego plays with itself; two players; the view of the network.
 
@@ -53,6 +63,8 @@ def check_run(config: EgoRun, spec: EnvSpec) -> None:
         raise UserError("ego.partners", f"{config.method} plays with itself", "leave them out or choose another method")
     if not config.plays_itself and not partners:
         raise UserError("ego.partners", f"{config.method} needs partners", "name a population: popgen ego train PATH")
+    if config.plays_itself:
+        _check_alone(config)
     if isinstance(config, BrRun) and len(partners) != 1:
         raise UserError("ego.partners", "a best response has one partner", "name one member: PATH:3")
     if spec.num_players != 2:

@@ -6,8 +6,10 @@ import numpy as np
 import torch
 from support.small import kitchen
 
+from popgen.methods.ego.ego_learner import _describe_choices
 from popgen.methods.ego.ego_networks import EgoSizes
 from popgen.methods.ego.ego_policy import HierarchicalEgoPolicy
+from popgen.methods.ego.ego_rollout import Choices
 from popgen.methods.ego.two_levels import (
     advantages_of_decisions,
     cut_segments,
@@ -129,3 +131,11 @@ def test_a_skill_is_kept_for_its_duration_and_drawn_anew_in_a_new_episode() -> N
             assert set(memory["left"]) == {2, 3, 4}  # after its first step
         before = memory["skill"]
     assert changed[1] == changed[2] == 0 < changed[3] and changed[7] > 64 and changed[8] == 0
+
+
+def test_a_z_that_is_never_chosen_is_the_one_that_is_chosen_least() -> None:
+    """Four zs of which two are drawn, one three times as often: the last ones count too."""
+    skill = torch.tensor([[0, 0, 0, 1]])
+    nothing = torch.zeros(1, 4)
+    found = _describe_choices(Choices(skill, torch.ones(1, 4, dtype=torch.bool), nothing, nothing), 4, 0.0, 0.0)
+    assert (found["skill_least"], found["skill_most"]) == (0.0, 0.75)
