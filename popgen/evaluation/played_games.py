@@ -59,14 +59,16 @@ def count_people(games: Sequence[HumanGame]) -> list[PlayedGame]:
 
 
 def count_table_games(games: Sequence[TableGame]) -> dict[str, list[PlayedGame]]:
-    """Finished games of a table by whom people played with: `people`, or `people with` the other player's name."""
+    """Finished games of a table by whom people played with: `people`, or `people with` the other player's name.
+
+    Two people are one participant, whoever has which seat."""
     found: dict[str, list[PlayedGame]] = {}
     for game in games:
         if not any(game.people) or not game.finished:
             continue
         label = "people" if all(game.people) else f"people with {game.players[game.people.index(False)]}"
         counts = find_transition_events(game.env, game.states, game.actions).sum(0, dtype=np.float64)
-        together = " and ".join(game.players)
+        together = " and ".join(sorted(game.players))
         names = (together, together) if all(game.people) else game.players
         played = PlayedGame(game.layout, names, len(game.actions), float(game.dishes.sum()), counts, game.people)
         found.setdefault(label, []).append(played)

@@ -12,6 +12,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from popgen.errors import UserError
 from popgen.evaluation.convention_coverage import Coverage
 from popgen.evaluation.convention_effects import Effect
 from popgen.jsonable import jsonable
@@ -109,18 +110,27 @@ def to_sentences(reports: Sequence[PlayersReport]) -> list[str]:
 
 
 def write_conventions(reports: Sequence[PlayersReport], folder: Path) -> list[Path]:
-    """conventions.json and effects.csv."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write conventions.json and effects.csv; gives the paths.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
     written = [folder / "conventions.json", folder / "effects.csv"]
     described = jsonable({"players": [report.as_dict() for report in reports]})
-    written[0].write_text(json.dumps(described, indent=2, allow_nan=False) + "\n")
     rows = [
         {"players": report.label, "means": means, **jsonable(asdict(effect))}
         for report in reports
         for means, effects in (("within", report.within), ("pooled", report.pooled))
         for effect in effects
     ]
-    written[1].write_text(to_csv(rows, ("players", "means", *(field.name for field in fields(Effect)))))
+    columns = ("players", "means", *(field.name for field in fields(Effect)))
+    texts = (json.dumps(described, indent=2, allow_nan=False) + "\n", to_csv(rows, columns))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in zip(written, texts, strict=True):
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(str(folder), f"cannot be written: {error.strerror}", "choose another folder") from error
     return written
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from support.small import kitchen
 
 from popgen.cli.parser import parse
 from popgen.envs.overcooked.transition_events import EVENTS
@@ -20,7 +22,8 @@ from popgen.evaluation.convention_effects import (
     measure_effects,
     tabulate_effects,
 )
-from popgen.evaluation.played_games import PlayedGame, count_people
+from popgen.evaluation.played_games import PlayedGame, count_people, count_table_games
+from popgen.humans.record_tables import TableGame
 from popgen.humans.recordings import load_games
 from popgen.reports.conventions_report import PlayersReport, effects_table, to_sentences, write_conventions
 
@@ -148,3 +151,20 @@ def test_the_report_is_readable_and_complete(tmp_path) -> None:  # type: ignore[
 def test_a_threshold_is_a_number_above_zero() -> None:
     with pytest.raises(UserError, match="threshold"):
         parse(["conventions", "--threshold", "0"])
+
+
+def test_two_people_are_one_participant_whoever_has_which_seat() -> None:
+    env = kitchen(horizon=4)
+    states, nothing = env.get_state().repeat(4, 0), np.full((4, 2), 4, np.uint8)
+    tables = [
+        TableGame(env, "room", trial, players, (True, True), states, nothing, np.zeros(4))
+        for trial, players in (("1", ("ann", "bob")), ("2", ("bob", "ann")), ("3", ("bob", "cid")))
+    ]
+    samples = collect_samples(count_table_games(tables)["people"])
+    assert samples.clusters.tolist() == [0, 0, 0, 0, 1, 1]
+
+
+def test_a_report_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written"):
+        write_conventions([PlayersReport("people", 0, [], [], {})], tmp_path / "file")
