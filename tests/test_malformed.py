@@ -348,7 +348,10 @@ SETTINGS = {
     "a variable that is not set": ("run.id=${oc.env:POPGEN_NOWHERE}", "POPGEN_NOWHERE"),
     "a name with a line break": ("run.id='a\nb'", "run.id"),
     "a tracking store without a place": ("tracking.uri=sqlite://", "tracking.uri"),
-    "an evaluation without end": ("evaluation.episodes=100000 population.size=1000", "evaluation.episodes"),
+    "an evaluation without end": (
+        "evaluation.episodes=100000 population.size=1000 replay.capacity=1000000",
+        "evaluation.episodes",
+    ),
     "another environment's parameters": ("env.name=rendezvous/mppmr", "env=NAME"),
 }
 
