@@ -321,8 +321,7 @@ class TrainingDriver:
             self._add_member(record)
             return False
         if not isinstance(record, Progress):
-            self.estimate.begin(record)
-            self.reporter.phase(title_of_phase(record, self.config.population.size), record.total)
+            self._begin_phase(record)
             return False
         self._record_steps(record)
         self._record_figures(record)
@@ -334,6 +333,14 @@ class TrainingDriver:
             self.reporter.expect(self.estimate.seconds_left())
             self.reporter.update(record.done, **record.shown)
         return isinstance(record, Round) and self._save_if_due(record)
+
+    def _begin_phase(self, phase: Phase) -> None:
+        """One that goes on where an earlier attempt was says so at once, and not after its next round."""
+        self.estimate.begin(phase)
+        self.reporter.phase(title_of_phase(phase, self.config.population.size), phase.total)
+        if phase.done:
+            self.reporter.expect(self.estimate.seconds_left())
+            self.reporter.update(phase.done)
 
     def _record_steps(self, record: Progress) -> None:
         for sampled in record.sampled:

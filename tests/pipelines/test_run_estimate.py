@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -323,6 +324,41 @@ def test_another_attempt_goes_on_with_what_was_measured() -> None:
     again.load_state(json.loads(json.dumps(estimate.to_state())))
     again.begin(Phase("play", 100, 5))
     assert spend(again, later, 3.0, 10) == pytest.approx(3.9 * 30.0, rel=0.1)
+
+
+class Screen(NullReporter):
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[Any, ...]] = []
+
+    def phase(self, name: str, total: float) -> None:
+        self.lines.append((name, total))
+
+    def expect(self, seconds: float | None) -> None:
+        self.lines.append(("left", seconds))
+
+    def update(self, done: float, **figures: Any) -> None:
+        self.lines.append(("done", done))
+
+
+def test_a_phase_that_goes_on_says_so_at_once() -> None:
+    """With 44 % done, and the time left as the earlier attempt knew it: 10 s for 100, of which 56 are left."""
+    config = RunConfig.parse(compose(["env=overcooked/cramped_room", "scale=demo"]))
+    spec, screen = make_env(config.env.name, 1).spec, Screen()
+    known: State = {"seconds": 40.0, "cost": 40.0}
+    phases = {"self-play": {"seconds": 40.0, "costs": {"self-play": 40.0}}}
+    training: Any = SimpleNamespace(plan=lambda: [PlannedPhase("self-play", 1, 10.0)])
+    recorder: Any = SimpleNamespace(spec=spec)
+    driver = training_driver.TrainingDriver(config, recorder, screen, training, SimpleNamespace())  # type: ignore[arg-type]
+    driver.estimate.plan = driver.estimate.plan[:1]
+    driver.estimate.load_state({"work": known, "kinds": {"self-play": known}, "phases": phases, "ends": {}})
+    driver.take_in(Phase("self-play", 100, 1, done=44, ends_at=100))
+    name, left, done = screen.lines
+    assert name == ("member 1 of 2: self-play", 100) and done == ("done", 44)
+    assert left[0] == "left" and left[1] == pytest.approx(5.6, rel=0.01)
+    driver.take_in(Phase("self-play", 100, 2))
+    assert screen.lines[3:] == [("member 2 of 2: self-play", 100)], "a fresh phase waits for its first update"
 
 
 def test_a_run_goes_on_after_a_finished_member_with_what_was_measured(tmp_path: Path) -> None:
