@@ -83,9 +83,10 @@ def _configure_ego(pieces: Pieces, job: Job) -> RunConfig:
     assert job.wanted.teacher is not None
     settings: dict[str, Any] = {"run.root": str(job.folder.parent), "run.id": job.folder.name}
     settings |= {"run.seed": job.wanted.seed, "tracking.enabled": False}
-    method = next(word.partition("=")[2] for word in job.wanted.words if word.startswith("method="))
     teacher = pieces.find_job(job.wanted.teacher)
-    return make_ego_config(method, [str(teacher.folder / "population")], settings, scale=pieces.plan.budget.scale)
+    return make_ego_config(
+        job.wanted.method, [str(teacher.folder / "population")], settings, scale=pieces.plan.budget.scale
+    )
 
 
 def _measure_run(pieces: Pieces, job: Job, name: str) -> None:

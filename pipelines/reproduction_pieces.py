@@ -11,6 +11,7 @@ from typing import Any
 
 from popgen.config.run_config import RunConfig
 from popgen.durable_files import replace_file
+from popgen.methods.registry import recipe
 from popgen.pipelines.run_batch import named
 from popgen.reports.reproduction.target_records import Budget, Record, Target, WantedRun, WantedStudy
 from popgen.reports.run_record import differences, is_finished, planned_run, read_run
@@ -94,6 +95,7 @@ class Pieces:
         self.jobs: dict[str, Job] = {}
         self.wanted = {target.name: target.list_runs(plan.budget, plan.seeds) for target in plan.targets}
         self._keys: dict[WantedRun, str] = {}
+        self._digests: dict[WantedRun, str] = {}
         self._elsewhere = [read_run(path) for path in _find_runs(plan.elsewhere)]
         for runs in self.wanted.values():
             for run in runs:
@@ -138,19 +140,30 @@ class Pieces:
 
     def digest_settings(self, run: WantedRun) -> str:
         """Of everything that decides a run's figures: its settings, and those of the runs that it needs."""
-        job = self.find_job(run)
-        own: object = list(job.words)
-        if job.config is not None:
-            planned = planned_run(job.config)
-            own = [planned.environment.fingerprint, planned.method, job.config.population.size, planned.settings]
-        parts = [run.seed, own, [self.digest_settings(needed) for needed in run.needs]]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        if run not in self._digests:
+            job = self.find_job(run)
+            own = self._describe_ego(run) if job.config is None else _describe_run(job.config)
+            parts = [run.seed, own, [self.digest_settings(needed) for needed in run.needs]]
+            self._digests[run] = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        return self._digests[run]
+
+    def _describe_ego(self, run: WantedRun) -> list[Any]:
+        """What decides an ego, its partners aside: its words and its method's recipe."""
+        from popgen.pipelines.ego_training import find_ego_method
+
+        assert run.teacher is not None
+        teacher = self.find_job(run.teacher).config
+        assert teacher is not None
+        config = recipe(find_ego_method(run.method), teacher.env.name, self.plan.budget.scale)
+        return [list(run.words), _describe_run(config)]
 
     def _find_recorded(self, target: Target) -> dict[WantedRun, dict[str, Any]]:
-        """Entries of earlier records, with as many episodes, by the run of today that they stand for."""
-        same = [one for one in self.plan.records if one["target"] == target.name]
-        runs = [run for one in same if one["episodes"] == self.plan.budget.episodes for run in one["runs"]]
-        entries = {(run["row"], run.get("settings_digest")): run for run in runs}
+        """Entries of earlier records of the same budget, by the run of today that they stand for."""
+        budget = (target.name, self.plan.budget.name, self.plan.budget.episodes)
+        same = [one for one in self.plan.records if (one["target"], one["budget"], one["episodes"]) == budget]
+        entries = {(run["row"], run.get("settings_digest")): run for one in same for run in one["runs"]}
+        if not entries:
+            return {}
         found = {run: entries.get((run.row, self.digest_settings(run))) for run in self.wanted[target.name]}
         return {run: one for run, one in found.items() if one is not None and set(run.measures) <= set(one["figures"])}
 
@@ -239,6 +252,12 @@ class Pieces:
     def list_failures(self) -> list[str]:
         """Why pieces are not there, after an attempt."""
         return [f"{job.wanted.row}, seed {job.wanted.seed}: {job.failed}" for job in self.jobs.values() if job.failed]
+
+
+def _describe_run(config: RunConfig) -> list[Any]:
+    """What decides a population: rules, method, size and settings."""
+    planned = planned_run(config)
+    return [planned.environment.fingerprint, planned.method, config.population.size, planned.settings]
 
 
 def keep_last(words: Sequence[str]) -> tuple[str, ...]:

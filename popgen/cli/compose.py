@@ -30,7 +30,6 @@ OPEN_SECTIONS = ("env.params", "cluster.resources", "discovery.event_factors")  
 
 
 QUOTES = "'\""
-MISSING = "???"  # OmegaConf's mark
 CUSTOM_LAYOUT = "env=overcooked/custom"
 SEVERAL_RUNS = "popgen sweep makes several runs"
 
@@ -287,11 +286,10 @@ def _compose(
         config = _compose_groups(base, groups, folder)
         ConfigLoaderImpl._apply_overrides_to_config(fields, config)
         values = OmegaConf.to_container(config, resolve=not loose)
-        missing = [] if loose or MISSING not in repr(values) else sorted(OmegaConf.missing_keys(config))
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # the last for a number as a group's option
         raise _composition_error(error, overrides, folder, unknown) from None
     assert isinstance(values, dict)
-    for key in [] if loose else missing or _unset(values):
+    for key in [] if loose else sorted(_unset(values)):
         raise UserError(key, "has no value", f"give one with {key}=VALUE")
     return {str(key): value for key, value in values.items()}
 
@@ -413,8 +411,8 @@ def _quote_text(text: str) -> str:
 
 
 def _unset(values: Any, prefix: str = "") -> list[str]:
-    """Keys whose interpolation gave the mark of a missing value."""
-    if values == MISSING:
+    """Keys with OmegaConf's mark of a missing value, also where an interpolation gave it."""
+    if values == "???":
         return [prefix]
     items = values.items() if isinstance(values, dict) else ()
     return [key for name, item in items for key in _unset(item, f"{prefix}.{name}" if prefix else str(name))]

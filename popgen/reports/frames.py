@@ -84,10 +84,11 @@ class Sheet:
     bold: frozenset[tuple[int, int]] = frozenset()
 
     def to_markdown(self) -> str:
-        """The table alone, without its title."""
-        sides = ["left" if number < self.labels else "right" for number in range(self.frame.shape[1])]
-        cells = self.frame.map(lambda cell: str(cell).replace("|", "\\|"))
-        return cells.to_markdown(index=False, disable_numparse=True, colalign=sides)
+        """The table alone, without its title; cells are not padded, which would make long lines of short rows."""
+        sides = [":--" if number < self.labels else "--:" for number in range(self.frame.shape[1])]
+        cells = [[str(cell).replace("|", "\\|") for cell in row] for row in self.frame.to_numpy()]
+        rows = [[str(column) for column in self.frame.columns], sides, *cells]
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def to_rich(self) -> Table:
         """For the terminal."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import sys
@@ -13,10 +14,13 @@ import pytest
 from support.finished import finished_run
 
 import popgen.pipelines as pipelines
+from popgen.cli import reproduce_command
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.humans import proxies
-from popgen.pipelines import run_measures
+from popgen.methods import registry
+from popgen.methods.ego.config import EgoRun
+from popgen.pipelines import reproduction_pieces, run_measures
 from popgen.pipelines.run_measures import RunToMeasure, measure_costs, measure_curves, measure_held, measure_scores
 
 Run = Callable[..., tuple[int, str, str]]
@@ -174,6 +178,28 @@ def test_a_record_of_other_settings_tells_nothing(run: Run, training: Training, 
     code, out, _ = run("reproduce", "wall-clock", *SMALL, *change.split(), "--records", "kept", "--dry-run", "--json")
     done = json.loads(out)["targets"][0]["runs_done"]
     assert code == 0 and done == (3 if "kl_predecessors" in change else 0), "only XPM-WM has that setting"
+
+
+def test_an_egos_record_is_of_its_methods_recipe_and_its_teachers(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its digest changes with the recipe of its method, which its words do not hold, and with its partners."""
+
+    def digest(*words: str) -> str:
+        parser = argparse.ArgumentParser()
+        reproduce_command.add(parser.add_subparsers())
+        work = reproduce_command._plan_pieces(parser.parse_args(["reproduce", "ego", *words, "--budget", "smoke"]))
+        return next(work.digest_settings(one) for one in work.wanted["ego"] if one.teacher is not None)
+
+    before = digest()
+    assert before == digest() and before != digest("world_model.kl_predecessors=0.5", "population.size=3")
+    known = registry.recipe
+
+    def changed(method: str, *more: str) -> RunConfig:
+        config = known(method, *more)
+        assert isinstance(config, EgoRun)
+        return config.model_copy(update={"ego": config.ego.model_copy(update={"units": 7})})
+
+    monkeypatch.setattr(reproduction_pieces, "recipe", changed)
+    assert digest() != before
 
 
 def test_the_list_and_the_page(run: Run, training: Training, tmp_path: Path) -> None:

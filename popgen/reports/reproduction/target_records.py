@@ -102,6 +102,11 @@ class WantedRun:
     people: WantedStudy | None = None
 
     @property
+    def method(self) -> str:
+        """As its words name it."""
+        return next(word.partition("=")[2] for word in self.words if word.startswith("method="))
+
+    @property
     def needs(self) -> tuple[WantedRun, ...]:
         """Runs that must be finished before this one is measured, in order."""
         egos = () if self.people is None else self.people.egos
