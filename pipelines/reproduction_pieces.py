@@ -133,7 +133,8 @@ class Pieces:
         assert run.teacher is not None
         teacher = self.find_job(run.teacher)
         words = (*run.words, f"seed={run.seed}")
-        digest = hashlib.sha256(" ".join((teacher.folder.name, *words)).encode()).hexdigest()[:8]
+        own = teacher.folder.name if teacher.folder.parent == self.plan.out / "runs" else str(teacher.folder)
+        digest = hashlib.sha256(" ".join((own, *words)).encode()).hexdigest()[:8]
         return Job(run, self.plan.out / "runs" / f"ego-{teacher.folder.name}-{digest}", None, words)
 
     # What earlier records tell

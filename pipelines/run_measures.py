@@ -238,6 +238,8 @@ def measure_conventions(job: RunToMeasure) -> dict[str, Any]:
     an ego, how the dishes of simulated people beside it go with what those do."""
     if job.people is not None:
         games = play_study(job.people)
+        if not games:
+            raise UserError("study", "no game of it was finished", "give its games more time, or simulate more people")
         mean = float(np.mean([game.dish_rate for game in games]))
         return {**_list_effects(games), "games": len(games), "dishes": mean}
     games = count_members(load_population(job.folder / "population"), job.episodes, SEED)

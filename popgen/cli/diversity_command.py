@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them")
     parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
-    parser.add_argument("--episodes", type=at_least(1), default=20, help="for each partner and seat (%(default)s)")
+    parser.add_argument("--episodes", type=at_least(2), default=20, help="for each partner and seat (%(default)s)")
     parser.add_argument(
         "--kernel", type=share_of_one, default=0.5, help="TrajeDi's: 0 compares actions, 1 episodes (%(default)s)"
     )
@@ -66,7 +66,7 @@ def measure(args: argparse.Namespace) -> int:
     if len(responses) == len(players):
         over = measure_partners(make, players, responses, args.episodes, args.seed, choose=args.choose)
         measured["best responses"] = over
-    acting = measure_groups(make, groups, max(2, args.episodes), args.seed, kernel=args.kernel)
+    acting = measure_groups(make, groups, args.episodes, args.seed, kernel=args.kernel)
     report = describe_diversity(
         *(environment, args.episodes, args.seed, measured, len(responses)), actions=acting, kernel=args.kernel
     )

@@ -42,7 +42,7 @@ def test_responses_are_trained_once_and_played(run: Run, tmp_path: Path) -> None
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a" / FOLDER).rglob("*") if path.is_file()}
     assert run(*command)[0] == 0  # nothing is trained again
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "a" / FOLDER).rglob("*") if path.is_file()}
-    code, out, err = run("diversity", str(held), "--episodes", "1", "--choose", "1", "--json")
+    code, out, err = run("diversity", str(held), "--episodes", "2", "--choose", "1", "--json")
     assert code == 0 and set(json.loads(out)["over"]) == {"members", "best responses"}, err
     (groups,) = (open_sides({"partner": [("held", str(held))]}, str).sides["partner"],)
     assert set(find_responses(groups, None)) == {player.digest for player in groups[0].players}
@@ -71,7 +71,7 @@ def test_one_population_counts_once_and_one_label_of_partners_has_one_side(run: 
 
 def test_diversity_is_printed_and_refuses_in_one_line(run: Run, tmp_path: Path) -> None:
     held = population(tmp_path / "held", "lipo", 2, 2, 3)
-    code, out, err = run("diversity", str(held), "--episodes", "1", "--choose", "1")
+    code, out, err = run("diversity", str(held), "--episodes", "2", "--choose", "1")
     assert (code, err) == (0, "") and "0 of 2 partners have a best response" in out and "most diverse 1" in out
     assert {path.name for path in Path("diversity").iterdir()} == {f"diversity.{s}" for s in ("json", "csv", "md")}
     code, out, err = run("diversity", str(held), "--choose", "3")

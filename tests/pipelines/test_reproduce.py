@@ -21,7 +21,16 @@ from popgen.humans import proxies
 from popgen.methods import registry
 from popgen.methods.ego.config import EgoRun
 from popgen.pipelines import reproduction_pieces, run_measures
-from popgen.pipelines.run_measures import RunToMeasure, measure_costs, measure_curves, measure_held, measure_scores
+from popgen.pipelines.run_measures import (
+    RunToMeasure,
+    measure_conventions,
+    measure_costs,
+    measure_curves,
+    measure_held,
+    measure_scores,
+)
+from popgen.pipelines.simulated_study import StudyToSimulate
+from popgen.reports.reproduction.target_records import StudyBudget
 
 Run = Callable[..., tuple[int, str, str]]
 SMALL = ("population.size=2", "--budget", "smoke", "--out", "out", "--quiet")
@@ -151,6 +160,29 @@ def test_finished_runs_of_elsewhere_are_taken_if_they_are_the_same(
     assert all(one["taken_over"] for one in kept["runs"]) and len(kept["runs"]) == 4
     assert run(*there[:-4], "--out", "c", *there[-2:], "--quiet", "--seeds", "2")[0] == 0
     assert len(training.calls) == 8  # of another seed
+
+
+def test_an_ego_of_a_teacher_of_elsewhere_is_another_ego(run: Run, training: Training, tmp_path: Path) -> None:
+    """Its run's partners lie elsewhere, though the teacher's folder may have the same name."""
+    assert run("reproduce", "wall-clock", *SMALL)[0] == 0
+
+    def list_egos(*words: str) -> set[str]:
+        given = ["reproduce", "ego", "population.size=2", *words]
+        parser = argparse.ArgumentParser()
+        reproduce_command.add(parser.add_subparsers())
+        work = reproduce_command._plan_pieces(parser.parse_args([*given, "--budget", "smoke", "--out", "b"]))
+        return {job.folder.name for job in work.jobs.values() if job.config is None}
+
+    own, taken = list_egos(), list_egos("--runs", str(tmp_path / "out" / "runs"))
+    assert own == list_egos() and len(own) == len(taken) and own.isdisjoint(taken)
+
+
+def test_a_study_without_a_finished_game_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    size = StudyBudget(participants=1, pairs=1, tutorials=0, steps=20, random_keys=True)
+    people = StudyToSimulate(tmp_path, "E-A", {}, tmp_path, size, 1)
+    monkeypatch.setattr(run_measures, "play_study", lambda wanted: [])
+    with pytest.raises(UserError, match="no game of it was finished"):
+        measure_conventions(RunToMeasure(tmp_path, "E-A", 1, {}, people=people))
 
 
 def test_what_an_earlier_record_tells_is_not_made_again(run: Run, training: Training, tmp_path: Path) -> None:

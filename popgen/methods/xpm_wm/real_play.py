@@ -80,6 +80,12 @@ def seatings(member: int, partners: Sequence[int]) -> list[Pair]:
     return [pair for partner in partners for pair in ((member, partner), (partner, member))]
 
 
+def seed_of_round(member_seed: int, number: int) -> int:
+    """Of a later member's round, from 1 on; members' seeds follow one another, so from round 100 on it lies far off."""
+    hundreds, place = divmod(number, 100)
+    return member_seed * 100 + place + hundreds * 10**15
+
+
 def later_matches(member: int, pairs: Sequence[Pair], episodes_sp: int, episodes_xp: int, seed: int) -> list[Match]:
     """Self-play, and cross-play of every pair, in an order drawn by `seed`: an episode in each environment."""
     if not pairs:

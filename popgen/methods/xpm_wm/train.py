@@ -231,7 +231,7 @@ class LaterMember:
 
     def collect_real_episodes(self, published: MemberWeights) -> list[Sampled]:
         """Lines 17, 19, 20: one episode in each environment, pairs in a drawn order; partners have their filters."""
-        seed = self.seed * 100 + self.progress.rounds + 1
+        seed = real.seed_of_round(self.seed, self.progress.rounds + 1)
         matches = real.later_matches(self.member, self.pairs, self.phase.episodes_sp, self.episodes_xp, seed)
         policies = real.policy_snapshots(self.config, {**self.archive, self.member: published.acting})
         self.work.start_episodes(matches, policies, seed)

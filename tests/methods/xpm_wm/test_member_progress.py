@@ -12,7 +12,14 @@ from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm.config import DiscoveryConfig, Phase1Config, Phase2Config
 from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
 from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
-from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Tally, goes_by_tally, rare_events
+from popgen.methods.xpm_wm.real_play import (
+    Candidate,
+    MemberWeights,
+    Tally,
+    goes_by_tally,
+    rare_events,
+    seed_of_round,
+)
 from popgen.methods.xpm_wm.world_model import Starts
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
@@ -266,3 +273,15 @@ def test_progress_of_a_later_member_comes_back_from_a_checkpoint() -> None:
     assert again.constraint.multipliers == {1: 0.25}
     assert (again.rounds, again.plays, again.steps, again.since_best) == (3, True, 160, 2)
     assert again.strength.scores() == {1: 3.0} and again.best is not None and again.best.merit() == 3.0
+
+
+def test_no_two_rounds_of_any_members_share_a_seed() -> None:
+    assert seed_of_round(1002, 1) == 100_201 and seed_of_round(1002, 99) == 100_299
+    seeds = {
+        seed_of_round(1000 * run + member, number)
+        for run in (0, 1)
+        for member in range(2, 10)
+        for number in range(1, 350)
+    }
+    assert len(seeds) == 2 * 8 * 349
+    assert seed_of_round(2**31 * 1000, 350) < 2**63  # the most that generators take
