@@ -81,8 +81,8 @@ def _configure_ego(pieces: Pieces, job: Job) -> RunConfig:
     from popgen.pipelines.ego_training import make_ego_config
 
     assert job.wanted.teacher is not None
-    settings: dict[str, Any] = {"run.root": str(job.folder.parent), "run.id": job.folder.name}
-    settings |= {"run.seed": job.wanted.seed, "tracking.enabled": False}
+    place = {"run.root": str(job.folder.parent), "run.id": job.folder.name}
+    settings = {**pieces.plan.ego_settings, **place, "run.seed": job.wanted.seed, "tracking.enabled": False}
     teacher = pieces.find_job(job.wanted.teacher)
     return make_ego_config(
         job.wanted.method, [str(teacher.folder / "population")], settings, scale=pieces.plan.budget.scale

@@ -24,6 +24,14 @@ MEASURE_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
+class ComposedRun:
+    """A checked configuration, and the overrides that give it."""
+
+    config: RunConfig
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Plan:
     """What is to be made.
 
@@ -32,10 +40,11 @@ class Plan:
         out: folder of all pieces.
         settings: given on top of the budget's, for all runs that have them.
         command: that makes it again.
-        compose: overrides -> a checked configuration.
+        compose: overrides -> a checked configuration, and those of the overrides that its method has.
         elsewhere: folders with finished runs that are taken instead of new ones.
         records: earlier records, whose figures are kept where a run of today would have the same settings.
         trains: runs that are missing are made; without it what is finished is measured and told.
+        ego_settings: dotted field -> value on top of the egos' recipe.
     """
 
     targets: Sequence[Target]
@@ -44,10 +53,11 @@ class Plan:
     out: Path
     settings: Sequence[str]
     command: str
-    compose: Callable[[Sequence[str]], RunConfig]
+    compose: Callable[[Sequence[str]], ComposedRun]
     elsewhere: Sequence[Path] = ()
     records: Sequence[Record] = ()
     trains: bool = True
+    ego_settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -119,8 +129,8 @@ class Pieces:
         return job
 
     def _make_job(self, run: WantedRun) -> Job:
-        words = keep_last((*run.words, f"seed={run.seed}", *self.plan.settings))
-        config = named(self.plan.compose(words), self.plan.out / "runs")
+        composed = self.plan.compose(keep_last((*run.words, f"seed={run.seed}", *self.plan.settings)))
+        config, words = named(composed.config, self.plan.out / "runs"), composed.words
         planned = planned_run(config)
         for one in self._elsewhere:
             same = (one.seed, len(one.members)) == (planned.seed, config.population.size)
@@ -132,7 +142,7 @@ class Pieces:
     def _make_ego_job(self, run: WantedRun) -> Job:
         assert run.teacher is not None
         teacher = self.find_job(run.teacher)
-        words = (*run.words, f"seed={run.seed}")
+        words = (*run.words, f"seed={run.seed}", *(f"{key}={value}" for key, value in self.plan.ego_settings.items()))
         own = teacher.folder.name if teacher.folder.parent == self.plan.out / "runs" else str(teacher.folder)
         digest = hashlib.sha256(" ".join((own, *words)).encode()).hexdigest()[:8]
         return Job(run, self.plan.out / "runs" / f"ego-{teacher.folder.name}-{digest}", None, words)
@@ -149,14 +159,15 @@ class Pieces:
         return self._digests[run]
 
     def _describe_ego(self, run: WantedRun) -> list[Any]:
-        """What decides an ego, its partners aside: its words and its method's recipe."""
+        """What decides an ego, its partners aside: its words, its method's recipe and what was given on top."""
         from popgen.pipelines.ego_training import find_ego_method
 
         assert run.teacher is not None
         teacher = self.find_job(run.teacher).config
         assert teacher is not None
         config = recipe(find_ego_method(run.method), teacher.env.name, self.plan.budget.scale)
-        return [list(run.words), _describe_run(config)]
+        given = [dict(self.plan.ego_settings)] if self.plan.ego_settings else []
+        return [list(run.words), _describe_run(config), *given]
 
     def _find_recorded(self, target: Target) -> dict[WantedRun, dict[str, Any]]:
         """Entries of earlier records of the same budget, by the run of today that they stand for."""

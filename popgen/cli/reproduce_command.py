@@ -7,6 +7,8 @@ import shlex
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,6 @@ from popgen.cli.training import before_ray
 from popgen.errors import UserError
 
 if TYPE_CHECKING:
-    from popgen.config.run_config import RunConfig
     from popgen.pipelines.reproduction_pieces import Pieces
     from popgen.reports.reproduction.target_records import Budget
 
@@ -32,9 +33,10 @@ def add(commands: Any) -> None:
         reproduce,
         "a table or figure of the paper: its runs, our table beside the paper's, CSV and a chart",
         "--list shows all targets; TARGET `all` makes them all. Runs and what is measured of them are pieces in DIR, "
-        "shared by all targets; the same command goes on with what is missing. Settings (KEY=VALUE) are of all runs "
-        "whose methods have them. Exit code 2 if a piece failed; the others are made. Keys of --json: targets (name, "
-        "runs, runs_done, measures, measures_done, seconds_left, files) and failures; with --list: targets.",
+        "shared by all targets; the same command goes on with what is missing. Settings (KEY=VALUE) are of all "
+        "populations whose methods have them, or of all egos if only those have them. Exit code 2 if a piece failed; "
+        "the others are made. Keys of --json: targets (name, runs, runs_done, measures, measures_done, seconds_left, "
+        "files) and failures; with --list: targets.",
     )
     parser.add_argument("target", nargs="?", metavar="TARGET", help="see --list")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings of what is trained")
@@ -118,6 +120,7 @@ def _plan_pieces(args: argparse.Namespace) -> Pieces:
         [Path(folder) for folder in args.runs],
         [] if args.records is None else read_records(Path(args.records)),
         trains=not args.finished,
+        ego_settings=_read_ego_settings(budget, args.overrides, args.config_dir),
     )
     return Pieces(plan)
 
@@ -142,23 +145,45 @@ def find_budget(name: str, layouts: Sequence[str] | None = None) -> Budget:
 
 
 def _make_composer(shared: Sequence[str], config_dir: str | None) -> Any:
-    """Overrides -> a checked configuration; a shared setting that only other methods have is left out."""
+    """Overrides -> a run; a shared setting that only other methods have is left out."""
     from popgen.config.run_config import RunConfig, field_names
     from popgen.methods.registry import METHODS
+    from popgen.pipelines.reproduction_pieces import ComposedRun
     from popgen.runs.preflight import preflight
 
     fields = {name: set(field_names(method.config)) for name, method in METHODS.items()}
     everywhere = set().union(*fields.values())
 
-    def compose_run(words: Sequence[str]) -> RunConfig:
+    def compose_run(words: Sequence[str]) -> ComposedRun:
         method = next(word.partition("=")[2] for word in words if word.startswith("method="))
         foreign = everywhere - fields[method]
         kept = [word for word in words if word not in shared or word.partition("=")[0] not in foreign]
         config = RunConfig.parse(compose(kept, config_dir))
         preflight(config)
-        return config
+        return ComposedRun(config, tuple(kept))
 
     return compose_run
+
+
+def _read_ego_settings(budget: Budget, overrides: Sequence[str], config_dir: str | None) -> dict[str, Any]:
+    """Dotted field -> value of the settings that only egos have.
+
+    Raises:
+        UserError: a value that does not fit.
+    """
+    from popgen.config.run_config import RunConfig, field_names
+    from popgen.methods.registry import METHODS
+    from popgen.pipelines.ego_training import find_ego_method
+    from popgen.reports.reproduction.run_lists import EGO
+
+    method = find_ego_method(EGO)
+    populations = (set(field_names(one.config)) for one in METHODS.values() if not one.trains_ego)
+    own = set(field_names(METHODS[method].config)).difference(*populations)
+    words = [word for word in overrides if word.partition("=")[0] in own]
+    if not words:
+        return {}
+    values = RunConfig.parse(compose([f"method={method}", f"scale={budget.scale}", *words], config_dir)).as_dict()
+    return {key: reduce(getitem, key.split("."), values) for key in (word.partition("=")[0] for word in words)}
 
 
 def _list_targets(args: argparse.Namespace) -> int:

@@ -15,12 +15,13 @@ from support.finished import finished_run
 
 import popgen.pipelines as pipelines
 from popgen.cli import reproduce_command
+from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.humans import proxies
 from popgen.methods import registry
 from popgen.methods.ego.config import EgoRun
-from popgen.pipelines import reproduction_pieces, run_measures
+from popgen.pipelines import reproduce, reproduction_pieces, run_measures
 from popgen.pipelines.run_measures import (
     RunToMeasure,
     measure_conventions,
@@ -177,6 +178,38 @@ def test_an_ego_of_a_teacher_of_elsewhere_is_another_ego(run: Run, training: Tra
     assert own == list_egos() and len(own) == len(taken) and own.isdisjoint(taken)
 
 
+def test_settings_that_only_egos_have_are_of_the_egos(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    parser = argparse.ArgumentParser()
+    reproduce_command.add(parser.add_subparsers())
+    words = ["reproduce", "ego", "ego.steps=500", "evaluation.episodes=3", "--budget", "smoke", "--out", "b"]
+    work = reproduce_command._plan_pieces(parser.parse_args(words))
+    (ego, *_) = (job for job in work.jobs.values() if job.config is None)
+    teacher = next(job for job in work.jobs.values() if job.config is not None)
+    given: dict[str, Any] = {}
+    monkeypatch.setattr("popgen.pipelines.ego_training.make_ego_config", lambda *_, **__: given.update(_[2]))
+    reproduce._configure_ego(work, ego)
+    assert given["ego.steps"] == 500 and "evaluation.episodes" not in given and "ego.steps=500" in ego.words
+    assert teacher.config is not None and teacher.config.evaluation.episodes == 3
+    assert "ego.steps=500" in work.describe_command(ego) and "ego.steps=500" not in work.describe_command(teacher)
+    code, _, err = run("reproduce", "ego", "ego.steps=many", "--budget", "smoke")
+    assert code == 2 and "ego.steps" in err
+
+
+def test_every_command_that_a_record_tells_makes_its_run() -> None:
+    """Settings that a method does not have are not in it."""
+    parser = argparse.ArgumentParser()
+    reproduce_command.add(parser.add_subparsers())
+    words = ["reproduce", "all", "world_model.kl_predecessors=0.5", "--budget", "laptop", "--seeds", "1", "--out", "b"]
+    work = reproduce_command._plan_pieces(parser.parse_args(words))
+    jobs = [job for job in work.jobs.values() if job.config is not None]
+    assert len(jobs) > 20
+    for job in jobs:
+        popgen, run, *given = work.describe_command(job).split()
+        assert (popgen, run) == ("popgen", "run")
+        config = RunConfig.parse(compose([*given, f"run.root={job.folder.parent}", f"run.id={job.folder.name}"]))
+        assert config == job.config
+
+
 def test_a_study_without_a_finished_game_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     size = StudyBudget(participants=1, pairs=1, tutorials=0, steps=20, random_keys=True)
     people = StudyToSimulate(tmp_path, "E-A", {}, tmp_path, size, 1)
@@ -223,6 +256,7 @@ def test_an_egos_record_is_of_its_methods_recipe_and_its_teachers(run: Run, monk
 
     before = digest()
     assert before == digest() and before != digest("world_model.kl_predecessors=0.5", "population.size=3")
+    assert len({before, digest("ego.steps=500"), digest("ego.steps=600")}) == 3
     known = registry.recipe
 
     def changed(method: str, *more: str) -> RunConfig:
