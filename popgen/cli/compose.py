@@ -463,7 +463,7 @@ def _composition_error(
         return UserError(
             "overrides", f"cannot read {_culprit(text, overrides)!r}", "write KEY=VALUE, with quotes around odd text"
         )
-    if (sweep := re.search(r"([\w.]+)=\w+\(.*--multirun|Sweep parameters '([\w.]+)", text)) is not None:
+    if (sweep := re.search(r"(?<![\w.])([\w.]+)=\w+\(.*--multirun|Sweep parameters '([\w.]+)", text)) is not None:
         fix = f"give one; {SEVERAL_RUNS}"
         return UserError(sweep[1] or sweep[2], "asks for several values", fix)
     if text.startswith("Ambiguous value"):
