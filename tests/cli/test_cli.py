@@ -66,6 +66,7 @@ BAD_OVERRIDES = {
     "key in the wrong section": (["method.lambda_xp=0.1"], "did you mean agent.lambda_xp?"),
     "unknown section": (["optimizer.lr=0.1"], "optimizer.lr"),
     "Hydra's own key": (["hydra.run.dir=x"], "hydra.run.dir"),
+    "Hydra's own key left out": (["~hydra/job_logging"], "hydra/job_logging"),
     "no equals sign": (["population.size"], "KEY=VALUE"),
     "unclosed brace": (["agent={"], "KEY=VALUE"),
     "several values": (["agent.lambda_xp=0.1,0.2"], "agent.lambda_xp=0.1,0.2"),
