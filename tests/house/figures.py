@@ -44,6 +44,12 @@ def parse_file(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+@cache
+def list_nodes(tree: ast.Module) -> list[ast.AST]:
+    """Every node of a file, which all bars share too."""
+    return [*ast.walk(tree)]
+
+
 def parse_sources(root: Path, *folders: str) -> Iterator[tuple[str, ast.Module]]:
     """(name relative to the root, syntax tree) of every file."""
     for path in list_sources(root, *folders):
@@ -54,13 +60,13 @@ def parse_sources(root: Path, *folders: str) -> Iterator[tuple[str, ast.Module]]
 def iter_functions(root: Path, *folders: str) -> Iterator[tuple[str, Function]]:
     """(file, function) for every function and method."""
     for name, tree in parse_sources(root, *folders):
-        yield from ((name, node) for node in ast.walk(tree) if isinstance(node, Function))
+        yield from ((name, node) for node in list_nodes(tree) if isinstance(node, Function))
 
 
 def iter_classes(root: Path) -> Iterator[tuple[str, ast.ClassDef]]:
     """(file, class) for every class."""
     for name, tree in parse_sources(root):
-        yield from ((name, node) for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+        yield from ((name, node) for node in list_nodes(tree) if isinstance(node, ast.ClassDef))
 
 
 def count_lines(node: Function | ast.ClassDef) -> int:
@@ -93,7 +99,7 @@ def find_method_literals(root: Path) -> list[str]:
         f"{name}:{node.lineno} {node.value!r}"
         for name, tree in parse_sources(root)
         if not name.startswith(("popgen/methods/", "conf/"))
-        for node in ast.walk(tree)
+        for node in list_nodes(tree)
         if isinstance(node, ast.Constant) and node.value in methods
     ]
 
@@ -131,7 +137,7 @@ def find_many_returns(root: Path) -> list[str]:
     return [
         f"{name}:{node.value.lineno} num_returns={node.value.value}"
         for name, tree in parse_sources(root)
-        for node in ast.walk(tree)
+        for node in list_nodes(tree)
         if isinstance(node, ast.keyword) and node.arg == "num_returns" and isinstance(node.value, ast.Constant)
         if node.value.value >= 3
     ]
@@ -153,7 +159,7 @@ def find_positional_counters(root: Path) -> list[str]:
     return [
         f"{name}:{node.lineno}"
         for name, tree in parse_sources(root)
-        for node in ast.walk(tree)
+        for node in list_nodes(tree)
         if isinstance(node, ast.Dict)
         for key, value in zip(node.keys, node.values, strict=True)
         if isinstance(key, ast.Constant) and key.value == "counters" and isinstance(value, ast.List | ast.Tuple)
@@ -254,7 +260,7 @@ def name_module(path: Path) -> str:
 
 def iter_targets(tree: ast.Module, package: str, modules: set[str]) -> Iterator[str]:
     """Modules of this project that a file imports."""
-    for node in ast.walk(tree):
+    for node in list_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in modules)
         elif isinstance(node, ast.ImportFrom):
