@@ -9,9 +9,11 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import support.checked_shapes  # noqa: F401  (before anything of popgen)
+from support.stores import keep_tables
 
 for _name, _value in {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -48,6 +50,23 @@ def needs_ray(item: pytest.Item) -> bool:
     """Whether a test uses a Ray of its module, or stands in a file that imports Ray or starts clusters."""
     assert isinstance(item, pytest.Function)
     return "cluster" in item.fixturenames or hasattr(item.module, "ray") or item.path.name in WITH_RAY
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """MLflow, once a test needs it, makes the tables of a store once."""
+    from popgen.runs.mlflow_tracker import Tracker
+
+    open_store, kept = Tracker._open_store, tmp_path_factory.mktemp("mlflow") / "tables.db"
+
+    def open_with_tables(tracker: Tracker) -> None:
+        Tracker._open_store = open_store  # from now on it is MLflow that is other
+        keep_tables(kept)
+        open_store(tracker)
+
+    Tracker._open_store = open_with_tables
+    yield
+    Tracker._open_store = open_store
 
 
 @pytest.fixture(scope="session")
@@ -101,6 +120,21 @@ def run(
         return code, out, err
 
     return call
+
+
+@pytest.fixture
+def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Charts are drawn coarsely and without fitting their parts, for tests that look at other things; tests/reports
+    draws them as users get them."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+
+    def save_coarsely(figure: Figure, path: Path, **options: Any) -> None:
+        figure.set_layout_engine("none")
+        save(figure, path, **{**options, "dpi": 40})
+
+    monkeypatch.setattr(Figure, "savefig", save_coarsely)
 
 
 @pytest.fixture

@@ -16,6 +16,8 @@ from popgen.pages.report_source import read_source
 from popgen.pages.run_report import CARD, choose_games, report_page, write_run_report
 from popgen.population import load_population
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 MEGABYTES = 2**20
 
 

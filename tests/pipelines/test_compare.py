@@ -25,6 +25,8 @@ from popgen.progress import NullReporter
 from popgen.runs.ledger import Ledger
 from popgen.runs.mlflow_tracker import SCALING_METRIC
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 Run = Callable[..., tuple[int, str, str]]
 
 

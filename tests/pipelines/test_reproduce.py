@@ -33,6 +33,8 @@ from popgen.pipelines.run_measures import (
 from popgen.pipelines.simulated_study import StudyToSimulate
 from popgen.reports.reproduction.target_records import StudyBudget
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 Run = Callable[..., tuple[int, str, str]]
 SMALL = ("population.size=2", "--budget", "smoke", "--out", "out", "--quiet")
 

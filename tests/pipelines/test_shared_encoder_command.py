@@ -10,6 +10,8 @@ from support.finished import finished_run
 
 from popgen.cli import main
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 
 def finished(root: Path, kind: str, final: float) -> Path:
     """Two members; the second's self-play rises evenly to `final` within 600 simulated steps."""
