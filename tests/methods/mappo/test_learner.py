@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,12 @@ ENV = EnvConfig(params={"horizon": 20})
 PPO = PpoConfig(units=16, layers=1, envs=4, steps=20, epochs=2, minibatches=2, learning_rate=1e-2)
 CROSS = DiversityConfig(order="sequential", xp_envs=4, mp_envs=4, lambda_xp=0.5)
 SPEC = make_env(ENV.name, 1, **ENV.params).spec
+
+
+@pytest.fixture(autouse=True)
+def short_stacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """RLlib asks who makes each part of a learner, and would read the source of pytest's whole stack each time."""
+    monkeypatch.setattr(inspect, "stack", partial(inspect.stack, 0))
 
 
 def learner(job: Job) -> PooledLearner:
