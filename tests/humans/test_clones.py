@@ -138,6 +138,7 @@ def test_unknown_layouts_and_halves(tmp_path: Path) -> None:
             fit_population(tmp_path / "p", layout, half)
 
 
+@pytest.mark.end_to_end
 def test_fit_and_show(
     run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch, games: list[HumanGame]
 ) -> None:

@@ -16,6 +16,8 @@ from popgen.pipelines.best_responses import FOLDER, find_response, find_response
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.population import PopulationWriter
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 Run = Callable[..., tuple[int, str, str]]
 
 
@@ -29,6 +31,7 @@ def population(path: Path, method: str, seed: int, *members: int) -> Path:
     return path
 
 
+@pytest.mark.end_to_end
 def test_responses_are_trained_once_and_played(run: Run, tmp_path: Path) -> None:
     ego, held = population(tmp_path / "ego", "mappo", 1, 1), population(tmp_path / "a" / "held", "lipo", 2, 2, 3)
     small = ("--response-set", "scale=smoke", "ego.steps=400", "evaluation.episodes=1", "--episodes", "1", "--quiet")

@@ -69,6 +69,7 @@ def launch(root: Path, name: str, config: EgoRun, monkeypatch: pytest.MonkeyPatc
     return root / name
 
 
+@pytest.mark.end_to_end
 @pytest.mark.parametrize("method", ["hipt", "fcp", "sp_aug"])
 def test_a_run_that_was_killed_ends_as_one_that_was_not(
     method: str, partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -33,6 +33,8 @@ from popgen.pipelines.training_driver import RunEstimate, costs_of, plan_evaluat
 from popgen.progress import NullReporter
 from popgen.runs.checkpoints import CheckpointFiles, resolve_handles
 
+pytestmark = pytest.mark.usefixtures("quick_pictures")
+
 
 class Clock:
     """A clock that a test sets."""
@@ -361,6 +363,7 @@ def test_a_phase_that_goes_on_says_so_at_once() -> None:
     assert screen.lines[3:] == [("member 2 of 2: self-play", 100)], "a fresh phase waits for its first update"
 
 
+@pytest.mark.end_to_end
 def test_a_run_goes_on_after_a_finished_member_with_what_was_measured(tmp_path: Path) -> None:
     """Trained in this process to its end, then the same command: the estimate comes from what the member left."""
     words = ["method=xpm_sim", "env=rendezvous/mppmr", "scale=smoke", "population.size=1", "evaluation.episodes=1"]

@@ -41,6 +41,7 @@ def write_members(path: Path, layout: str) -> Path:
     return path
 
 
+@pytest.mark.end_to_end
 def test_one_study_serves_all_egos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulated_study, "run_dry", run_here)
     egos = {name: [write_members(tmp_path / f"{name}-{one}", one) for one in LAYOUTS] for name in ("E-A", "E-B")}

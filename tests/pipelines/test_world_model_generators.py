@@ -135,6 +135,7 @@ def test_members_of_mep_meet_nobody_and_are_paid_for_surprise(fcp: Path, mep: Pa
     assert paid and not any('"member": 1,' in line for line in paid)
 
 
+@pytest.mark.end_to_end
 @pytest.mark.parametrize(
     ("method", "size", "death"),
     [

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from conftest import ROOT
 
 PROGRAM = """
@@ -43,6 +44,7 @@ print(population.info(1).kind, played.length.tolist(), played.steps)
 """
 
 
+@pytest.mark.end_to_end
 def test_a_fresh_interpreter_without_the_training_stack(model_run: Path) -> None:
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", PROGRAM, str(model_run / "population")]
