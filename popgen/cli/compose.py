@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -310,49 +310,25 @@ def _split_fields(translated: list[str]) -> tuple[list[str], list[Override]]:
 
 
 def _compose_groups(base: dict[str, Any], words: list[str], folder: Path | None) -> DictConfig:
-    """What Hydra composes of the schema and the groups that are chosen. It takes its time, so that what came of conf/
-    alone is kept: the runs of a sweep differ in fields."""
+    """What Hydra composes of the schema and the groups that are chosen. It takes a tenth of a second, so that what came
+    of conf/ alone is kept: the runs of a sweep differ in fields."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    from popgen.conf import DIRECTORY
+
     installed = _installed_options()
     name = json.dumps([base, words, {group: sorted(options) for group, options in installed.items()}])
     if folder is None and name in _COMPOSED:
         return pickle.loads(_COMPOSED[name])
     _store_groups(base, installed, folder)
-    config = _compose_words(words, folder)
+    GlobalHydra.instance().clear()
+    search = [] if folder is None else [f"hydra.searchpath=[{json.dumps(folder.as_uri())}]"]
+    with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
+        config = hydra_compose("config", [*search, *words])
     if folder is None:
         _COMPOSED[name] = pickle.dumps(config)
-    return config
-
-
-def _compose_words(words: list[str], folder: Path | None) -> DictConfig:
-    """`hydra.compose` without Hydra's own settings, which are two thirds of its work and of which nothing is kept."""
-    from hydra import version
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
-    from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
-    from hydra._internal.defaults_list import create_defaults_list
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.core.plugins import Plugins
-    from hydra.core.utils import setup_globals
-    from hydra.types import RunMode
-    from omegaconf import OmegaConf
-
-    from popgen.conf import DIRECTORY
-
-    version.setbase("1.3")
-    setup_globals()  # resolvers, such as ${now:...}
-    Plugins.instance()  # finds what reads files and the store
-    search = ConfigSearchPathImpl()
-    for root in (DIRECTORY, *([] if folder is None else [folder])):
-        search.append("main", f"file://{root}")
-    search.append("schema", "structured://")  # the store, which Hydra wants last
-    loader = ConfigLoaderImpl(search)
-    repository = loader.repository
-    vars(repository)["load_config"] = cache(repository.load_config)  # each file is asked for several times
-    parsed = OverridesParser.create().parse_overrides(words)
-    loader.validate_sweep_overrides_legal(parsed, RunMode.RUN, from_shell=False)
-    found = create_defaults_list(repository, "config", parsed, prepend_hydra=False, skip_missing=False)
-    config = loader._compose_config_from_defaults_list(found.defaults, repository)
-    OmegaConf.set_struct(config, True)
-    loader._apply_overrides_to_config(found.config_overrides, config)
     return config
 
 
@@ -360,22 +336,15 @@ def _store_groups(base: dict[str, Any], installed: dict[str, set[str]], folder: 
     """What Hydra composes from beside files: the schema with its recipe, and groups of what others have installed."""
     from hydra.core.config_store import ConfigStore
 
-    ConfigStore.instance().store(name="schema", node=base)
+    store = ConfigStore.instance()
+    store.store(name="schema", node=base)
     for group, options in installed.items():
         for option in options - _file_options(group, folder):
-            _store_option(group, option)
-
-
-@cache
-def _store_option(group: str, option: str) -> None:
-    from hydra.core.config_store import ConfigStore
-
-    inner, _, name = f"{group}/{option}".rpartition("/")
-    if group == "env":
-        node, package = {"name": option, "params": {}}, "env"
-    else:
-        node, package = {group: option}, "_global_"
-    ConfigStore.instance().store(group=inner, name=name, node=node, package=package)
+            inner, _, name = f"{group}/{option}".rpartition("/")
+            if group == "env":
+                store.store(group=inner, name=name, node={"name": option, "params": {}}, package="env")
+            else:
+                store.store(group=inner, name=name, node={group: option}, package="_global_")
 
 
 def _installed_options() -> dict[str, set[str]]:
@@ -425,7 +394,7 @@ def _translate(override: str) -> str:
     """Aliases, and `++` for dictionaries that take any key, so that users need not know Hydra's signs."""
     key, equals, value = override.partition("=")
     if equals and key or override.startswith("~"):
-        if key.lstrip("+~").startswith("hydra"):
+        if key.lstrip("+").startswith("hydra"):
             raise UserError(key, "Hydra's own settings have no use here", "leave it out")
         if key in ALIASES:
             return f"{ALIASES[key]}={value}"
