@@ -74,7 +74,7 @@ def compare(args: argparse.Namespace) -> int:
     if args.json:
         print_json(report)
         return OK
-    print_report([sheet.to_rich() for sheet in to_sheets(report)], report["notes"], args.out, report["files"])
+    print_report(to_sheets(report), report["notes"], args.out, report["files"])
     if shown := report["tracking"]:
         print("mlflow: " + "\n        ".join(line for line in (shown["command"], shown["address"]) if line))
     return OK

@@ -74,5 +74,5 @@ def measure(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**report, "files": {name: str(path) for name, path in files.items()}})
         return OK
-    print_report([sheet.to_rich() for sheet in list_sheets(report)], list_lines(report), args.out, files, width=110)
+    print_report(list_sheets(report), list_lines(report), args.out, files, width=110)
     return OK

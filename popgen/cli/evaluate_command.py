@@ -134,8 +134,12 @@ def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
         print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
         return OK
     sheets = [matrix_sheet(report, narrow=True), mixed_play_sheet(report)]
-    tables = [sheet.to_rich() for sheet in sheets if sheet is not None]
-    print_report(tables, summary(report), str(out), [path.name for path in files.values()])
+    print_report(
+        (sheet for sheet in sheets if sheet is not None),
+        summary(report),
+        str(out),
+        [path.name for path in files.values()],
+    )
     return OK
 
 
@@ -166,8 +170,7 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**report, "files": {suffix: str(path) for suffix, path in files.items()}})
         return OK
-    tables = [sheet.to_rich() for sheet in to_sheets(report)]
-    print_report(tables, list_lines(report), str(out), [path.name for path in files.values()], width=80)
+    print_report(to_sheets(report), list_lines(report), str(out), [path.name for path in files.values()], width=80)
     return OK
 
 

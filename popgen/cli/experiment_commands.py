@@ -111,8 +111,7 @@ def self_sabotage(args: argparse.Namespace) -> int:
     if args.json:
         print_json(report)
         return OK
-    tables = [sheet.to_rich() for sheet in to_sheets(report)]
-    print_report(tables, [*NOTES, *summary(report)], args.out, report["files"])
+    print_report(to_sheets(report), [*NOTES, *summary(report)], args.out, report["files"])
     return OK
 
 

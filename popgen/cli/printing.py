@@ -6,9 +6,15 @@ import json
 import sys
 from collections.abc import Iterable, Mapping
 from textwrap import wrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from popgen.jsonable import jsonable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from popgen.reports.frames import Sheet
 
 OK, ERROR, WEAK, INTERRUPTED = 0, 2, 3, 130
 
@@ -25,20 +31,35 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 def print_table(table: Any, width: int | None = None) -> None:
     """One of rich's, `width` columns wide: by default the terminal's."""
-    from rich.console import Console
-
-    # Piped output has no width of its own; tables of many members must not be cut.
-    console = Console(width=width or (None if sys.stdout.isatty() else 200))
+    console = _open_console(width)
     with console.capture() as captured:  # rich ends the process where the reader went away
         console.print(table)
     print(captured.get(), end="")
 
 
+def _open_console(width: int | None) -> Console:
+    from rich.console import Console
+
+    # Piped output has no width of its own; tables of many members must not be cut.
+    return Console(width=width or (None if sys.stdout.isatty() else 200))
+
+
+def print_sheet(sheet: Sheet, width: int | None = None) -> None:
+    """As one table, or as several below each other where its figures would be cut."""
+    for part in sheet.split(_open_console(width).width):
+        print_table(part.to_rich(), width)
+
+
 def print_report(
-    tables: Iterable[Any], lines: Iterable[str], out: str, files: Iterable[str], width: int | None = None
+    tables: Iterable[Sheet | Table], lines: Iterable[str], out: str, files: Iterable[str], width: int | None = None
 ) -> None:
     """Tables, sentences, and where the report's files are."""
+    from rich.table import Table
+
     for table in tables:
-        print_table(table, width)
+        if isinstance(table, Table):
+            print_table(table, width)
+        else:
+            print_sheet(table, width)
     told = [part for line in lines for part in (wrap(line, width) if width else [line])]
     print("\n".join([*told, f"report: {out} ({', '.join(files)})"]))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir, at_least, expand_home
 from popgen.cli.compose import compose
-from popgen.cli.printing import OK, print_json, print_table
+from popgen.cli.printing import OK, print_json, print_sheet
 from popgen.cli.training import before_ray
 from popgen.errors import UserError
 
@@ -245,7 +245,7 @@ def _print_screen(work: Pieces, *, to_stderr: bool) -> None:
         lines = [f"{row['target']:18}runs {row['runs']:10}measures {row['measures']:10}{row['left']}" for row in rows]
         print("\n".join([*lines, text]), file=sys.stderr)
         return
-    print_table(Sheet(f"budget {work.plan.budget.name}, in {work.plan.out}", pd.DataFrame(rows)).to_rich())
+    print_sheet(Sheet(f"budget {work.plan.budget.name}, in {work.plan.out}", pd.DataFrame(rows)))
     print(text)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, compose_record, to_yaml
-from popgen.cli.printing import OK, WEAK, print_json, print_table
+from popgen.cli.printing import OK, WEAK, print_json, print_sheet
 from popgen.cli.standard_streams import keep_native_lines
 from popgen.cli.training import before_ray, tell_notes
 from popgen.durable_files import read_regular
@@ -141,7 +141,7 @@ def _print_run(result: Mapping[str, Any]) -> None:
     from popgen.reports.run_findings import next_commands
 
     evaluation = result["evaluation"]
-    print_table(matrix_sheet(evaluation, narrow=True).to_rich())
+    print_sheet(matrix_sheet(evaluation, narrow=True))
     print("\n".join(summary(evaluation)))
     if findings := result.get("findings"):
         print("\nwhat it means")

@@ -68,7 +68,7 @@ def sweep(args: argparse.Namespace) -> int:
     elif report["runs"]:
         from popgen.reports.sweep_report import summary, to_sheets
 
-        print_report([sheet.to_rich() for sheet in to_sheets(report)], summary(report), args.out, report["files"])
+        print_report(to_sheets(report), summary(report), args.out, report["files"])
     if report["missing"]:
         first = report["missing"][0]
         problem = f"{len(report['missing'])} of {len(configs)} runs did not finish, {first['id']}: {first['error']}"

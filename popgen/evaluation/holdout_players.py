@@ -91,6 +91,7 @@ class Group:
         players: in order.
         lineages: of the populations that they come from.
         partners: lineages of the populations that they were trained with; empty where nothing is known of any.
+        on_record: the records of all say with whom they were trained, if with nobody.
     """
 
     label: str
@@ -98,6 +99,7 @@ class Group:
     players: tuple[Player, ...]
     lineages: tuple[Lineage, ...] = ()
     partners: tuple[Lineage, ...] = ()
+    on_record: bool = False
 
     @property
     def taught_by(self) -> frozenset[str]:
@@ -193,7 +195,8 @@ def _describe_population(label: str, population: Population) -> Group:
     digests = frozenset(info.policy_sha256 for info in population.members) - {NO_WEIGHTS}
     own = Lineage(manifest.method, manifest.seed, manifest.config_digest, digests)
     partners = [one for info in population.members for one in read_partners(str(population.path), info.extra)]
-    return Group(label, manifest.method, players, (own,), tuple(dict.fromkeys(partners)))
+    on_record = all(TRAINED_WITH in info.extra for info in population.members)
+    return Group(label, manifest.method, players, (own,), tuple(dict.fromkeys(partners)), on_record)
 
 
 def _read_pair(extra: Mapping[str, Any]) -> int:
@@ -241,6 +244,7 @@ def _join_groups(first: Group, second: Group) -> Group:
         first.players + second.players,
         first.lineages + second.lineages,
         tuple(dict.fromkeys(first.partners + second.partners)),
+        first.on_record and second.on_record,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pandas as pd
@@ -90,12 +90,42 @@ class Sheet:
         rows = [[str(column) for column in self.frame.columns], sides, *cells]
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
+    def split(self, width: int) -> list[Sheet]:
+        """Sheets beside each other in the place of one whose cells would be cut at so many characters: each has the
+        labels and as many of the figures as fit, at least one."""
+        needed = [self._measure_column(column) + len(" |") + 1 for column in range(self.frame.shape[1])]
+        used = 1 + sum(needed[: self.labels])
+        parts: list[list[int]] = []
+        room = 0
+        for column in range(self.labels, len(needed)):
+            if needed[column] > room:
+                parts.append([])
+                room = width - used
+            parts[-1].append(column)
+            room -= needed[column]
+        if len(parts) < 2:
+            return [self]
+        return [self._take_columns(columns, first=columns is parts[0]) for columns in parts]
+
+    def _measure_column(self, column: int) -> int:
+        """Characters that its longest cell takes; words of the header of figures stand below each other."""
+        header = str(self.frame.columns[column])
+        words = [header] if column < self.labels else header.split()
+        return max(map(len, [*words, *self.frame.iloc[:, column].astype(str)]), default=0)
+
+    def _take_columns(self, columns: Sequence[int], *, first: bool) -> Sheet:
+        kept = [*range(self.labels), *columns]
+        bold = frozenset((row, kept.index(column)) for row, column in self.bold if column in kept)
+        title = self.title if first else f"{self.title} (continued)"
+        return replace(self, title=title, frame=self.frame.iloc[:, kept], bold=bold)
+
     def to_rich(self) -> Table:
         """For the terminal."""
         table = Table(title=Text(self.title))
         for number, label in enumerate(self.frame.columns):
             is_label = number < self.labels
-            table.add_column(Text(str(label)), justify="left" if is_label else "right", no_wrap=is_label)
+            sides = {"justify": "left" if is_label else "right", "no_wrap": is_label}
+            table.add_column(Text(str(label)), min_width=self._measure_column(number), **sides)
         for row, cells in enumerate(self.frame.to_numpy()):
             texts = [Text(str(cell), "bold" if (row, column) in self.bold else "") for column, cell in enumerate(cells)]
             table.add_row(*texts, style="dim" if row in self.dim else None)

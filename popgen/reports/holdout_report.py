@@ -154,9 +154,9 @@ def _write_notes(result: HoldoutResult) -> list[str]:
         notes.append(
             f"{useless} of {total} partners scores nothing even so: there the clipped BR-Prox is 1 by definition."
         )
-    known = [group.label for group in casting.egos if not group.partners]
-    if known:
-        notes.append(f"What they were trained with is not on record: {', '.join(known)}.")
+    unknown = [group.label for group in casting.egos if not group.on_record]
+    if unknown:
+        notes.append(f"What they were trained with is not on record: {', '.join(unknown)}.")
     return notes
 
 

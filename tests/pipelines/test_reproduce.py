@@ -201,7 +201,17 @@ def test_every_command_that_a_record_tells_makes_its_run() -> None:
     """Settings that a method does not have are not in it."""
     parser = argparse.ArgumentParser()
     reproduce_command.add(parser.add_subparsers())
-    words = ["reproduce", "table1", "world_model.kl_predecessors=0.5", "--budget", "laptop", "--seeds", "1", "--out", "b"]
+    words = [
+        "reproduce",
+        "table1",
+        "world_model.kl_predecessors=0.5",
+        "--budget",
+        "laptop",
+        "--seeds",
+        "1",
+        "--out",
+        "b",
+    ]
     work = reproduce_command._plan_pieces(parser.parse_args(words))
     jobs = [job for job in work.jobs.values() if job.config is not None]
     assert len(jobs) == 7
