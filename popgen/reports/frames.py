@@ -65,6 +65,10 @@ def to_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
     return frame.to_csv(index=False, lineterminator="\n")
 
 
+WHOLE = 24
+"""Characters of the longest cell that is a figure, with its error or interval."""
+
+
 @dataclass(frozen=True)
 class Sheet:
     """A table for people.
@@ -108,10 +112,12 @@ class Sheet:
         return [self._take_columns(columns, first=columns is parts[0]) for columns in parts]
 
     def _measure_column(self, column: int) -> int:
-        """Characters that its longest cell takes; words of the header of figures stand below each other."""
+        """Characters that it takes at least: figures stay whole; sentences, and headers of figures, break at words."""
         header = str(self.frame.columns[column])
-        words = [header] if column < self.labels else header.split()
-        return max(map(len, [*words, *self.frame.iloc[:, column].astype(str)]), default=0)
+        texts = [header] if column < self.labels else header.split()
+        for cell in self.frame.iloc[:, column].astype(str):
+            texts += [cell] if column < self.labels or len(cell) <= WHOLE else cell.split()
+        return max(map(len, texts), default=0)
 
     def _take_columns(self, columns: Sequence[int], *, first: bool) -> Sheet:
         kept = [*range(self.labels), *columns]

@@ -31,6 +31,14 @@ def test_each_part_has_a_figure_however_narrow_and_marks_stay_with_their_cells()
     assert all(part.dim == {1} and list(part.frame["ego"]) == ["HiPT", "FCP"] for part in parts)
 
 
+def test_sentences_break_at_words() -> None:
+    """Widths: `| HiPT ` 7, `| advantage ` 12, and the last line: 20."""
+    sheet = Sheet(
+        "given", pd.DataFrame([["HiPT", "advantage bounded by 1.5 from the start"]], columns=["ego", "given"])
+    )
+    assert sheet.split(20) == [sheet]
+
+
 @pytest.mark.parametrize("width", [24, 30, 37, 38, 80])
 def test_no_figure_is_cut(width: int, capsys: pytest.CaptureFixture[str]) -> None:
     print_sheet(Sheet("scores", FRAME), width)
