@@ -95,9 +95,9 @@ class Sheet:
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
     def split(self, width: int) -> list[Sheet]:
-        """Sheets beside each other in the place of one whose cells would be cut at so many characters: each has the
-        labels and as many of the figures as fit, at least one."""
-        needed = [self._measure_column(column) + len(" |") + 1 for column in range(self.frame.shape[1])]
+        """Sheets to be shown below each other in the place of one whose cells would be cut at so many characters: each
+        has the labels and as many of the figures as fit, at least one."""
+        needed = [self._measure_column(column) + len("|  ") for column in range(self.frame.shape[1])]
         used = 1 + sum(needed[: self.labels])
         parts: list[list[int]] = []
         room = 0

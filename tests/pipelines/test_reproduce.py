@@ -165,15 +165,19 @@ def test_finished_runs_of_elsewhere_are_taken_if_they_are_the_same(
     assert len(training.calls) == 8  # of another seed
 
 
+def plan_pieces(*words: str) -> reproduction_pieces.Pieces:
+    """What the command would make; nothing is trained."""
+    parser = argparse.ArgumentParser()
+    reproduce_command.add(parser.add_subparsers())
+    return reproduce_command._plan_pieces(parser.parse_args(["reproduce", *words, "--out", "b"]))
+
+
 def test_an_ego_of_a_teacher_of_elsewhere_is_another_ego(run: Run, training: Training, tmp_path: Path) -> None:
     """Its run's partners lie elsewhere, though the teacher's folder may have the same name."""
     assert run("reproduce", "wall-clock", *SMALL)[0] == 0
 
     def list_egos(*words: str) -> set[str]:
-        given = ["reproduce", "ego", "population.size=2", *words]
-        parser = argparse.ArgumentParser()
-        reproduce_command.add(parser.add_subparsers())
-        work = reproduce_command._plan_pieces(parser.parse_args([*given, "--budget", "smoke", "--out", "b"]))
+        work = plan_pieces("ego", "population.size=2", "--budget", "smoke", *words)
         return {job.folder.name for job in work.jobs.values() if job.config is None}
 
     own, taken = list_egos(), list_egos("--runs", str(tmp_path / "out" / "runs"))
@@ -181,10 +185,7 @@ def test_an_ego_of_a_teacher_of_elsewhere_is_another_ego(run: Run, training: Tra
 
 
 def test_settings_that_only_egos_have_are_of_the_egos(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    parser = argparse.ArgumentParser()
-    reproduce_command.add(parser.add_subparsers())
-    words = ["reproduce", "ego", "ego.steps=500", "evaluation.episodes=3", "--budget", "smoke", "--out", "b"]
-    work = reproduce_command._plan_pieces(parser.parse_args(words))
+    work = plan_pieces("ego", "ego.steps=500", "evaluation.episodes=3", "--budget", "smoke")
     (ego, *_) = (job for job in work.jobs.values() if job.config is None)
     teacher = next(job for job in work.jobs.values() if job.config is not None)
     given: dict[str, Any] = {}
@@ -199,20 +200,7 @@ def test_settings_that_only_egos_have_are_of_the_egos(run: Run, monkeypatch: pyt
 
 def test_every_command_that_a_record_tells_makes_its_run() -> None:
     """Settings that a method does not have are not in it."""
-    parser = argparse.ArgumentParser()
-    reproduce_command.add(parser.add_subparsers())
-    words = [
-        "reproduce",
-        "table1",
-        "world_model.kl_predecessors=0.5",
-        "--budget",
-        "laptop",
-        "--seeds",
-        "1",
-        "--out",
-        "b",
-    ]
-    work = reproduce_command._plan_pieces(parser.parse_args(words))
+    work = plan_pieces("table1", "world_model.kl_predecessors=0.5", "--budget", "laptop", "--seeds", "1")
     jobs = [job for job in work.jobs.values() if job.config is not None]
     assert len(jobs) == 7
     for job in jobs:
@@ -261,9 +249,7 @@ def test_an_egos_record_is_of_its_methods_recipe_and_its_teachers(run: Run, monk
     """Its digest changes with the recipe of its method, which its words do not hold, and with its partners."""
 
     def digest(*words: str) -> str:
-        parser = argparse.ArgumentParser()
-        reproduce_command.add(parser.add_subparsers())
-        work = reproduce_command._plan_pieces(parser.parse_args(["reproduce", "ego", *words, "--budget", "smoke"]))
+        work = plan_pieces("ego", *words, "--budget", "smoke")
         return next(work.digest_settings(one) for one in work.wanted["ego"] if one.teacher is not None)
 
     before = digest()
