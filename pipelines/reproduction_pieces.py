@@ -83,11 +83,13 @@ class Job:
     measures: list[str] = field(default_factory=list)
     failed: str = ""
     people: WantedStudy | None = None
+    _done: bool = False
 
     @property
     def done(self) -> bool:
-        """The run is finished."""
-        return is_finished(self.folder)
+        """The run is finished; one that is stays so, and its folder is not read again."""
+        self._done = self._done or is_finished(self.folder)
+        return self._done
 
 
 class Pieces:

@@ -36,6 +36,8 @@ SEVERAL_RUNS = "popgen sweep makes several runs"
 CHOICES = ("method", "scale", "env")
 """Groups that decide which schema and which recipe the other settings stand on."""
 
+_GROUP_CHOICE = rf"({'|'.join((*CHOICES, 'cluster', 'tracking'))})=[\w/.-]+"
+
 _COMPOSED: dict[str, bytes] = {}
 """What this process has composed of conf/ and groups, by all that it depends on; pickled, which copies it fastest."""
 
@@ -311,25 +313,39 @@ def _split_fields(translated: list[str]) -> tuple[list[str], list[Override]]:
 
 def _compose_groups(base: dict[str, Any], words: list[str], folder: Path | None) -> DictConfig:
     """What Hydra composes of the schema and the groups that are chosen. It takes a tenth of a second, so that what came
-    of conf/ alone is kept: the runs of a sweep differ in fields."""
+    of conf/ alone is kept: the runs of a sweep differ in fields, and their methods in what lies beneath the groups."""
+    from omegaconf import DictConfig, OmegaConf
+
+    installed = _installed_options()
+    name = json.dumps([base, words, {group: sorted(options) for group, options in installed.items()}])
+    if folder is None and name in _COMPOSED:
+        return pickle.loads(_COMPOSED[name])
+    if base and folder is None and all(re.fullmatch(_GROUP_CHOICE, word) for word in words):
+        config = OmegaConf.merge(base, _compose_groups({}, words, None))
+        assert isinstance(config, DictConfig)
+        OmegaConf.set_struct(config, True)
+    else:
+        config = _run_hydra(base, words, folder, installed)
+    if folder is None:
+        _COMPOSED[name] = pickle.dumps(config)
+    return config
+
+
+def _run_hydra(
+    base: dict[str, Any], words: list[str], folder: Path | None, installed: dict[str, set[str]]
+) -> DictConfig:
+    """Hydra's defaults list: the schema, then a file of each group."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
 
     from popgen.conf import DIRECTORY
 
-    installed = _installed_options()
-    name = json.dumps([base, words, {group: sorted(options) for group, options in installed.items()}])
-    if folder is None and name in _COMPOSED:
-        return pickle.loads(_COMPOSED[name])
     _store_groups(base, installed, folder)
     GlobalHydra.instance().clear()
     search = [] if folder is None else [f"hydra.searchpath=[{json.dumps(folder.as_uri())}]"]
     with initialize_config_dir(str(DIRECTORY), version_base="1.3"):
-        config = hydra_compose("config", [*search, *words])
-    if folder is None:
-        _COMPOSED[name] = pickle.dumps(config)
-    return config
+        return hydra_compose("config", [*search, *words])
 
 
 def _store_groups(base: dict[str, Any], installed: dict[str, set[str]], folder: Path | None) -> None:
