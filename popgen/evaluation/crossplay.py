@@ -182,6 +182,12 @@ class CrossPlayResult:
         after = Estimate.average([one.reset if reset else one.kept for one in plays])
         return after.divide(plays[0].ordinary)
 
+    def fresh_share(self, member: int) -> Estimate:
+        """What a new game of as many steps as the switch leaves is of ordinary self-play: cross-play that leaves an
+        empty kitchen costs that much. NaN as in `share`; the two parts come from the same episodes."""
+        plays = [one for one in self.mixed if one.member == member]
+        return plays[0].fresh.divide(plays[0].ordinary) if plays else Estimate(math.nan, math.nan)
+
     @property
     def obstruction(self) -> dict[str, bool]:
         """Partner -> mean XP is below the members' mean beside it, by more than two standard errors."""

@@ -6,6 +6,9 @@ seat of m: m plays with k until step t, then m takes both seats, and its score f
 ordinary self-play after the same step. A member with memory goes on with it, or forgets it at the switch: a difference
 between the two shows a handshake that its memory keeps.
 
+Self-play goes on with the soups that it has begun, and cross-play leaves few. How much that is worth, a new game of as
+many steps as were left after the switch tells: what is less than its share is lost to the partner.
+
 CoMeDi (Sarkar et al. 2023) trains with such episodes; here they judge every method.
 """
 
@@ -36,6 +39,7 @@ class MixedPlay:
         seat: that it had before.
         kept, reset: after cross-play, with its memory kept and forgotten; the same where it has none.
         ordinary: in its self-play after the same steps.
+        fresh: in the first steps of that self-play, as many as were left after the switch.
     """
 
     member: int
@@ -44,6 +48,7 @@ class MixedPlay:
     kept: Estimate
     reset: Estimate
     ordinary: Estimate
+    fresh: Estimate
 
     def share(self, *, reset: bool = False) -> Estimate:
         """Part of ordinary self-play that remains; NaN where that scores nothing."""
@@ -77,9 +82,15 @@ class Switch:
 
 @dataclass(frozen=True)
 class SwitchedScores:
-    """(B,) score of each episode from its switch on, 0 for one that ended before; and the steps of all."""
+    """Of each episode (B,), and the steps of all.
+
+    Attributes:
+        scores: from its switch on, 0 for one that ended before.
+        openings: in its first steps, as many as the switch leaves.
+    """
 
     scores: np.ndarray
+    openings: np.ndarray
     steps: int
 
 
@@ -98,16 +109,17 @@ def play_switches(env: BatchedEnv, policies: list[Policy], switches: list[Switch
     env_seed, seat_seed = (int(part >> 1) for part in np.random.SeedSequence(seed).generate_state(2))
     env.reset(seed=env_seed)
     seating.reset(seat_seed)
-    gained, open_ = np.zeros(len(switches)), np.ones(len(switches), bool)
+    gained, opening, open_ = np.zeros(len(switches)), np.zeros(len(switches)), np.ones(len(switches), bool)
     seen: dict[str, np.ndarray] = {}
     for time in itertools.count():
         if len(now := np.flatnonzero(steps == time)):
             seating.change_seats(now, after[now], forget[now])
         result = advance(env, seating, seen)
         gained += np.where(open_ & (steps <= time), result.score, 0.0)
+        opening += np.where(open_ & (time < env.spec.horizon - steps), result.score, 0.0)
         open_ &= ~result.done
         if not open_.any():
-            return SwitchedScores(gained, (time + 1) * len(switches))
+            return SwitchedScores(gained, opening, (time + 1) * len(switches))
         if result.done.any():
             env.reset(indices=np.flatnonzero(result.done))
         seating.ended(result.done)
@@ -149,9 +161,11 @@ def play_mixed(
         if progress is not None:
             progress(sum(len(done.scores) for done in scores))
     table = np.concatenate([part.scores for part in scores]).reshape(len(programme), episodes)
+    openings = np.concatenate([part.openings for part in scores])[: len(policies) * episodes].reshape(-1, episodes)
     found = {key: Estimate.of(row) for key, row in zip(programme, table, strict=True)}
+    fresh = [Estimate.of(row) for row in openings]  # self-play of all comes first
     plays = [
-        _describe_case(numbers, found, before, after)
+        _describe_case(numbers, found, fresh, before, after)
         for (before, after), forget in programme
         if not forget and before != after
     ]
@@ -180,10 +194,15 @@ def _list_cases(policies: Sequence[Policy]) -> list[_Case]:
 
 
 def _describe_case(
-    numbers: list[int], found: Mapping[_Case, Estimate], before: tuple[int, int], after: tuple[int, int]
+    numbers: list[int],
+    found: Mapping[_Case, Estimate],
+    fresh: Sequence[Estimate],
+    before: tuple[int, int],
+    after: tuple[int, int],
 ) -> MixedPlay:
     own = after[0]
     seat = before.index(own)
     kept = found[(before, after), False]
     reset = found.get(((before, after), True), kept)
-    return MixedPlay(numbers[own], numbers[before[1 - seat]], seat, kept, reset, found[(after, after), False])
+    ordinary = found[(after, after), False]
+    return MixedPlay(numbers[own], numbers[before[1 - seat]], seat, kept, reset, ordinary, fresh[own])

@@ -17,8 +17,9 @@ Keys of the JSON object (`to_json`); a figure is `{"mean": x, "standard_error": 
                              each that was found: pair, partner, member, xp, beside and p_value (corrected by Holm)
     mixed_play               what remains of a member's self-play after cross-play: episodes; members: member, and
                              seat_0, seat_1 (the seat it had before), each with kept and reset (its memory at the
-                             switch): shares as figures, and least (of its partners, kept); cases: member, partner,
-                             seat, kept, reset and ordinary (scores after the switch)
+                             switch): shares as figures, and least (of its partners, kept), and fresh (the share
+                             that a new game of as many steps gives: what is less is lost to partners); cases: member,
+                             partner, seat, kept, reset and ordinary (scores after the switch) and fresh
     event_names, event_weights
     pairs                    every pairing: seat_0, seat_1 (a member's number, "random" or "idle"), score, reward and
                              shaped_return (sum over seats) as figures; scores of the episodes; events: mean count per
@@ -106,12 +107,16 @@ def _describe_mixed(result: CrossPlayResult) -> dict[str, Any]:
     cases = [
         {
             **{"member": one.member, "partner": one.partner, "seat": one.seat},
-            **{"kept": one.kept.to_dict(), "reset": one.reset.to_dict(), "ordinary": one.ordinary.to_dict()},
+            **{name: getattr(one, name).to_dict() for name in ("kept", "reset", "ordinary", "fresh")},
         }
         for one in result.mixed
     ]
     members = [
-        {"member": member, **{f"seat_{seat}": _describe_shares(result, member, seat) for seat in (0, 1)}}
+        {
+            "member": member,
+            **{f"seat_{seat}": _describe_shares(result, member, seat) for seat in (0, 1)},
+            "fresh": result.fresh_share(member).to_dict(),
+        }
         for member in (result.members if cases else ())
     ]
     return {"episodes": -(-result.episodes // 2), "members": members, "cases": cases}
@@ -235,10 +240,15 @@ def mixed_play_sheet(report: Mapping[str, Any]) -> Sheet | None:
             here = one[f"seat_{seat}"]
             row |= {f"seat {seat} {way}": estimate_text(here[way]) for way in ("kept", "reset")}
             row[f"least {seat}"] = number_text(here["least"])
+        if "fresh" in one:  # not in a report of an older version
+            row["new game"] = estimate_text(one["fresh"])
         cells.append(row)
     if not cells:
         return None
-    title = "share of ordinary self-play after cross-play, by seat; memory kept, reset; least of its partners"
+    title = (
+        "share of ordinary self-play after cross-play, by seat; memory kept, reset; least of its partners; "
+        "and that of a new game of as many steps"
+    )
     return Sheet(title, pd.DataFrame(cells))
 
 

@@ -45,6 +45,24 @@ def test_an_episode_changes_hands_at_its_step() -> None:
     switches = [Switch((0, 1), (0, 0), step, False) for step in (1, 4)] + [Switch((0, 1), (1, 1), 2, True)]
     played = play_switches(TallyEnv(3), [Script([ONE]), Script([TWO])], switches, 0)
     assert played.scores.tolist() == [5 * 11, 2 * 11, 4 * 22] and played.steps == 3 * HORIZON
+    # as many steps as the switch leaves, from the first on: the first of the three changes hands within them
+    assert played.openings.tolist() == [21 + 4 * 11, 2 * 21, 2 * 21 + 2 * 22]
+
+
+def test_a_new_game_tells_what_begun_work_is_worth() -> None:
+    """A member that earns nothing in its first two steps earns less in a new game than after any switch."""
+    late = Script([STAY, STAY, ONE, ONE, ONE, ONE])
+    got = evaluated(late, Script([ONE]), episodes=8)
+    first, steady = (next(one for one in got.mixed if one.member == member) for member in (1, 2))
+    assert first.fresh.mean < first.ordinary.mean and got.fresh_share(1).mean < 1.0
+    assert steady.fresh == steady.ordinary and got.fresh_share(2).mean == 1.0
+    report = to_dict(got)
+    assert report["mixed_play"]["members"][1]["fresh"]["mean"] == 1.0
+    sheet = mixed_play_sheet(report)
+    assert sheet is not None and sheet.frame["new game"].tolist()[1].startswith("1.00 ")
+    del report["mixed_play"]["members"][0]["fresh"], report["mixed_play"]["members"][1]["fresh"]
+    sheet = mixed_play_sheet(report)
+    assert sheet is not None and "new game" not in sheet.frame
 
 
 def test_a_member_without_memory_goes_on_as_ever() -> None:
@@ -134,7 +152,7 @@ def test_chance_below_is_rarely_small_where_nothing_is(samples: int) -> None:
 def test_shares_of_one_self_play_do_not_average_its_error_out() -> None:
     """Ten partners after whom exactly 5 of 10 +- 1 remain: a share of 0.5, whose error is that of the 10."""
     exact, ordinary = Estimate(5.0, 0.0), Estimate(10.0, 1.0)
-    plays = tuple(MixedPlay(1, partner, 0, exact, exact, ordinary) for partner in range(2, 12))
+    plays = tuple(MixedPlay(1, partner, 0, exact, exact, ordinary, ordinary) for partner in range(2, 12))
     got = replace(evaluated(Script([ONE])), mixed=plays).share(1, 0)
     assert got.mean == 0.5 and got.error == pytest.approx(0.05)
 
