@@ -122,7 +122,12 @@ def _plan_pieces(args: argparse.Namespace) -> Pieces:
         trains=not args.finished,
         ego_settings=_read_ego_settings(budget, args.overrides, args.config_dir),
     )
-    return Pieces(plan)
+    work = Pieces(plan)
+    taken = {word.partition("=")[0] for job in work.jobs.values() for word in job.words}
+    for word in args.overrides:
+        if (key := word.partition("=")[0]) not in taken:
+            raise UserError(key, f"no run of {args.target} has it", "leave it out, or set it for another target")
+    return work
 
 
 def find_budget(name: str, layouts: Sequence[str] | None = None) -> Budget:

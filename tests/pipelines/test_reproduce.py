@@ -198,9 +198,15 @@ def test_settings_that_only_egos_have_are_of_the_egos(run: Run, monkeypatch: pyt
     assert code == 2 and "ego.steps" in err
 
 
+@pytest.mark.parametrize("word", ["ego.steps=500", "world_model.kl_predecessors=0.5"])
+def test_a_setting_that_no_run_has_is_refused(run: Run, word: str) -> None:
+    code, _, err = run("reproduce", "table1", word, "--budget", "smoke", "--dry-run")
+    assert code == 2 and f"{word.partition('=')[0]}: no run of table1 has it" in err
+
+
 def test_every_command_that_a_record_tells_makes_its_run() -> None:
     """Settings that a method does not have are not in it."""
-    work = plan_pieces("table1", "world_model.kl_predecessors=0.5", "--budget", "laptop", "--seeds", "1")
+    work = plan_pieces("table1", "diversity.warmup=5", "--budget", "laptop", "--seeds", "1")
     jobs = [job for job in work.jobs.values() if job.config is not None]
     assert len(jobs) == 7
     for job in jobs:
