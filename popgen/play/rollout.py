@@ -216,6 +216,20 @@ def advance(env: BatchedEnv, seating: Seating, seen: dict[str, np.ndarray]) -> S
     return env.step(seating.act(seen))
 
 
+def _take_counted_step(
+    env: BatchedEnv,
+    seating: Seating,
+    seen: dict[str, np.ndarray],
+    record: Callable[[Transition], None] | None,
+    counted: np.ndarray,
+) -> StepBatch:
+    if record is None:
+        return advance(env, seating, seen)
+    step = take_step(env, seating)
+    record(replace(step, counted=counted.copy()))
+    return step.result
+
+
 def play(
     env: BatchedEnv,
     policies: Sequence[Policy],
@@ -223,6 +237,7 @@ def play(
     *,
     seed: int,
     record: Callable[[Transition], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Episodes:
     """Play one full episode in each of the environment's B rows.
 
@@ -232,6 +247,7 @@ def play(
         seats: (B, P) int, index of the policy for each row and seat.
         seed: decides the environment's and every policy's draws: same arguments, same episodes.
         record: called after each step, before finished rows are reset.
+        progress: called after each step with the episodes that as many steps would fill.
 
     Raises:
         ValueError: `seats` of a wrong shape or range.
@@ -247,12 +263,7 @@ def play(
     open_, terminated, steps = np.ones(batch, bool), np.zeros(batch, bool), 0
     seen: dict[str, np.ndarray] = {}
     while open_.any():
-        if record:
-            step = take_step(env, seating)
-            result = step.result
-            record(replace(step, counted=open_.copy()))
-        else:
-            result = advance(env, seating, seen)
+        result = _take_counted_step(env, seating, seen, record, open_)
         score += np.where(open_, result.score, 0.0)
         reward += np.where(open_, result.reward, 0.0)
         events += result.events * open_[:, None, None]
@@ -263,6 +274,8 @@ def play(
         if result.done.any() and open_.any():
             env.reset(indices=np.flatnonzero(result.done))
         seating.ended(result.done)
+        if progress:
+            progress(steps // spec.horizon)
     shaped = events @ np.asarray(spec.event_weights, np.float64)
     return Episodes(seating.seats.copy(), score, reward, events, shaped, length, terminated, steps)
 
@@ -283,7 +296,7 @@ def play_teams(
         make: (num_envs, seed) -> environment.
         policies: K distinct policies.
         matches: policy index per seat; row n of the result belongs to team n // episodes.
-        progress: called with (episodes done, episodes in all) after each batch.
+        progress: called with (episodes done, episodes in all), a batch that is played by what its steps would fill.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
@@ -293,7 +306,8 @@ def play_teams(
     parts = []
     for start, part_seed in zip(starts, seeds, strict=True):
         seats = rows[start : start + max_envs]
-        parts.append(play(make(len(seats), 0), policies, seats, seed=int(part_seed >> 1)))
+        tell = None if progress is None else lambda done, first=start: progress(first + done, len(rows))
+        parts.append(play(make(len(seats), 0), policies, seats, seed=int(part_seed >> 1), progress=tell))
         if progress:
             progress(start + len(seats), len(rows))
     return Episodes.concat(parts)
