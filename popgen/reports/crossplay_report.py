@@ -233,20 +233,23 @@ def _list_shares(report: Mapping[str, Any]) -> dict[str, list[float]]:
 
 def mixed_play_sheet(report: Mapping[str, Any]) -> Sheet | None:
     """Shares of self-play after cross-play, a member a row; None where there are none."""
-    cells = []
+    cells, seats = [], ("seat_0", "seat_1")
+    remember = any(one[seat]["kept"] != one[seat]["reset"] for one in _list_mixed(report) for seat in seats)
+    ways = {"kept": " kept", "reset": " reset"} if remember else {"kept": ""}
     for one in _list_mixed(report):
         row = {"member": str(one["member"])}
         for seat in (0, 1):
             here = one[f"seat_{seat}"]
-            row |= {f"seat {seat} {way}": estimate_text(here[way]) for way in ("kept", "reset")}
+            row |= {f"seat {seat}{name}": estimate_text(here[way]) for way, name in ways.items()}
             row[f"least {seat}"] = number_text(here["least"])
         if "fresh" in one:  # not in a report of an older version
             row["new game"] = estimate_text(one["fresh"])
         cells.append(row)
     if not cells:
         return None
+    memory = " with memory kept and reset" if remember else ""
     title = (
-        "share of ordinary self-play after cross-play, by seat; memory kept, reset; least of its partners; "
+        f"share of ordinary self-play after cross-play, by seat{memory}; least of its partners; "
         "and that of a new game of as many steps"
     )
     return Sheet(title, pd.DataFrame(cells))
