@@ -80,13 +80,10 @@ def _make_run(pieces: Pieces, job: Job, reporter: Reporter) -> None:
 def _configure_ego(pieces: Pieces, job: Job) -> RunConfig:
     from popgen.pipelines.ego_training import make_ego_config
 
-    assert job.wanted.teacher is not None
     place = {"run.root": str(job.folder.parent), "run.id": job.folder.name}
     settings = {**pieces.plan.ego_settings, **place, "run.seed": job.wanted.seed, "tracking.enabled": False}
-    teacher = pieces.find_job(job.wanted.teacher)
-    return make_ego_config(
-        job.wanted.method, [str(teacher.folder / "population")], settings, scale=pieces.plan.budget.scale
-    )
+    teachers = [str(pieces.find_job(one).folder / "population") for one in job.wanted.teachers]
+    return make_ego_config(job.wanted.method, teachers, settings, scale=pieces.plan.budget.scale)
 
 
 def _measure_run(pieces: Pieces, job: Job, name: str) -> None:
@@ -110,10 +107,8 @@ def _gather_study(pieces: Pieces, job: Job) -> StudyToSimulate | None:
         if not found.done:
             raise UserError("study", f"needs the ego of {ego.row}, seed {ego.seed}", "finish that run first")
         egos.setdefault(f"{EGO_MARK}{ego.row}", []).append(found.folder / "population")
-    first = job.people.egos[0].teacher
-    assert first is not None and job.wanted.teacher is not None
-    tutor = pieces.find_job(first).folder / "population"
-    name = f"{EGO_MARK}{job.wanted.teacher.row}"
+    tutor = pieces.find_job(job.people.egos[0].teachers[0]).folder / "population"
+    name = f"{EGO_MARK}{job.wanted.teachers[0].row}"
     return StudyToSimulate(pieces.plan.out / "studies", name, egos, tutor, job.people.size, job.wanted.seed)
 
 

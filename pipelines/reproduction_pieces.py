@@ -122,7 +122,7 @@ class Pieces:
         for needed in run.needs:
             self._add_job(needed)
         if run not in self._keys:
-            job = self._make_job(run) if run.teacher is None else self._make_ego_job(run)
+            job = self._make_ego_job(run) if run.teachers else self._make_job(run)
             self._keys[run] = str(job.folder)
             self.jobs.setdefault(str(job.folder), job)
         job = self.find_job(run)
@@ -142,12 +142,12 @@ class Pieces:
         return Job(run, planned.path, config, words)
 
     def _make_ego_job(self, run: WantedRun) -> Job:
-        assert run.teacher is not None
-        teacher = self.find_job(run.teacher)
+        folders = [self.find_job(one).folder for one in run.teachers]
         words = (*run.words, f"seed={run.seed}", *(f"{key}={value}" for key, value in self.plan.ego_settings.items()))
-        own = teacher.folder.name if teacher.folder.parent == self.plan.out / "runs" else str(teacher.folder)
-        digest = hashlib.sha256(" ".join((own, *words)).encode()).hexdigest()[:8]
-        return Job(run, self.plan.out / "runs" / f"ego-{teacher.folder.name}-{digest}", None, words)
+        own = [one.name if one.parent == self.plan.out / "runs" else str(one) for one in folders]
+        digest = hashlib.sha256(" ".join((*own, *words)).encode()).hexdigest()[:8]
+        more = f"-and-{len(folders) - 1}" if len(folders) > 1 else ""
+        return Job(run, self.plan.out / "runs" / f"ego-{folders[0].name}{more}-{digest}", None, words)
 
     # What earlier records tell
 
@@ -164,8 +164,7 @@ class Pieces:
         """What decides an ego, its partners aside: its words, its method's recipe and what was given on top."""
         from popgen.pipelines.ego_training import find_ego_method
 
-        assert run.teacher is not None
-        teacher = self.find_job(run.teacher).config
+        teacher = self.find_job(run.teachers[0]).config
         assert teacher is not None
         config = recipe(find_ego_method(run.method), teacher.env.name, self.plan.budget.scale)
         given = [dict(self.plan.ego_settings)] if self.plan.ego_settings else []
@@ -250,16 +249,16 @@ class Pieces:
 
     def describe_command(self, job: Job) -> str:
         """That makes the run."""
-        if job.wanted.teacher is None:
+        if not job.wanted.teachers:
             return " ".join(["popgen run", *job.words])
-        teacher = self.find_job(job.wanted.teacher).folder.name
-        return " ".join([f"popgen ego train {teacher}/population", *job.words])
+        teachers = [f"{self.find_job(one).folder.name}/population" for one in job.wanted.teachers]
+        return " ".join(["popgen ego train", *teachers, *job.words])
 
     def find_environment(self, run: WantedRun) -> str:
         """Where it plays: an ego where its teacher does, one beside people in all layouts."""
         if run.people is not None:
             return ALL_LAYOUTS
-        job = self.find_job(run.teacher or run)
+        job = self.find_job(run.teachers[0] if run.teachers else run)
         assert job.config is not None
         return job.config.env.name
 

@@ -256,7 +256,7 @@ def test_an_egos_record_is_of_its_methods_recipe_and_its_teachers(run: Run, monk
 
     def digest(*words: str) -> str:
         work = plan_pieces("ego", *words, "--budget", "smoke")
-        return next(work.digest_settings(one) for one in work.wanted["ego"] if one.teacher is not None)
+        return next(work.digest_settings(one) for one in work.wanted["ego"] if one.teachers)
 
     before = digest()
     assert before == digest() and before != digest("world_model.kl_predecessors=0.5", "population.size=3")

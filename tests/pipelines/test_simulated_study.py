@@ -71,7 +71,9 @@ def test_a_row_for_each_ego_over_all_layouts() -> None:
     people = rows[0].people
     assert people is not None and {row.people for row in rows} == {people}
     assert len(people.egos) == 3 * len(budget.layouts)
-    assert {ego.teacher for ego in people.egos} <= set(rows[0].needs) and set(people.egos) <= set(rows[0].needs)
+    assert {one for ego in people.egos for one in ego.teachers} <= set(rows[0].needs) and set(people.egos) <= set(
+        rows[0].needs
+    )
     games = people.size.tutorials + 2 * people.size.pairs * len(budget.layouts)
     assert (people.size.participants, games) == (40, 23)
     assert rows[0] in list_conventions(budget, [1])

@@ -110,11 +110,11 @@ def test_the_table_of_sabotage_has_every_objective_and_the_generators_every_meth
 
 def test_every_generator_has_an_ego_beside_the_same_holdouts_and_people() -> None:
     runs = TARGETS["generators"].list_runs(BUDGETS["laptop"], [1, 2])
-    egos = [one for one in runs if one.teacher is not None]
+    egos = [one for one in runs if one.teachers]
     assert len(egos) == len(runs) / 2 and all(set(one.measures) == {"holdout", "human"} for one in egos)
     for seed in (1, 2):
         for layout in BUDGETS["laptop"].layouts:
-            holdouts = {one.holdouts for one in egos if one.seed == seed and f"env={layout}" in one.teacher.words}
+            holdouts = {one.holdouts for one in egos if one.seed == seed and f"env={layout}" in one.teachers[0].words}
             assert len(holdouts) == 1 and {other.seed for other in next(iter(holdouts))} == {3 - seed}
     figures = {column.figure for column in TARGETS["generators"].columns}
     wanted = ("scores.sp", "scores.xp", "scores.mixed", "scores.obstructed", "diversity.log_determinant")
@@ -125,8 +125,12 @@ def test_every_generator_has_an_ego_beside_the_same_holdouts_and_people() -> Non
 def test_an_ego_is_held_against_populations_that_it_never_met() -> None:
     for seeds in ((1, 2, 3), (1,)):
         for one in TARGETS["ego"].list_runs(BUDGETS["laptop"], seeds):
-            assert one.teacher is not None and {other.seed for other in one.holdouts} != {one.teacher.seed}
-            assert len(one.holdouts) == 3
+            taught, held = ({other.seed for other in runs} for runs in (one.teachers, one.holdouts))
+            assert len(taught) == len(held) == 1 and taught != held and len(one.holdouts) == 4
+            assert {other.words[1] for other in (*one.teachers, *one.holdouts)} == {one.teachers[0].words[1]}
+    egos = TARGETS["ego"].list_runs(BUDGETS["laptop"], [1])
+    assert {one.method for one in egos} == {"hipt", "fcp"} and {len(one.teachers) for one in egos} == {1, 4}
+    assert len({one.row for one in egos}) == 10
 
 
 def test_a_target_that_is_not_there() -> None:

@@ -13,6 +13,9 @@ from popgen.reports.reproduction.target_records import Budget, WantedRun, Wanted
 EGO = "hipt"
 """The method of the paper's egos."""
 
+ONE_LEVEL = "fcp"
+"""The same networks and training without the ego's second level."""
+
 EGO_MARK = "E-"
 """Before the name of the method whose population an ego was trained with, as in the paper."""
 
@@ -20,6 +23,9 @@ MODEL, SIMULATOR = name_of(OWN_METHOD), name_of(SIMULATOR_METHOD)
 COMPARED = (MODEL, SIMULATOR, *(name_of(title) for title in BASELINES))
 TEACHERS = (*(name_of(title) for title in BASELINES), MODEL)
 """Whose populations train egos and are held out, in the paper's order."""
+
+ALL_TEACHERS = (MODEL, SIMULATOR, *sorted(name_of(title) for title in BASELINES))
+"""Of an ego that all methods' populations train."""
 
 NEEDS_RAY = "ppo.max_steps"
 """Methods with this setting learn on RLlib, which runs nowhere else."""
@@ -128,11 +134,11 @@ def list_study_rows(budget: Budget, seed: int) -> list[WantedRun]:
     words, found = (f"method={EGO}", f"scale={budget.scale}"), []
     for name in TEACHERS:
         teachers = (want_runs(budget, [seed], [name], [layout], [SCORES])[0] for layout in budget.layouts)
-        found.append([WantedRun(teacher.row, words, seed, (), teacher) for teacher in teachers])
+        found.append([WantedRun(teacher.row, words, seed, (), (teacher,)) for teacher in teachers])
     people = WantedStudy(tuple(ego for egos in found for ego in egos), budget.study)
     return [
         WantedRun(
-            f"{EGO_MARK}{egos[0].row}, clones of people", words, seed, ("conventions",), egos[0].teacher, (), people
+            f"{EGO_MARK}{egos[0].row}, clones of people", words, seed, ("conventions",), egos[0].teachers, (), people
         )
         for egos in found
     ]
@@ -143,27 +149,52 @@ def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     labels = [name for name, method in METHODS.items() if not method.trains_ego]
     measures = [SCORES, COSTS, "diversity", "acting", "conventions"]
     populations = want_runs(budget, seeds, labels, budget.layouts, measures)
-    return [*populations, *train_egos(budget, seeds, labels, ("holdout", "human"))]
+    egos = (train_egos(budget, seeds, seed, labels, ("holdout", "human")) for seed in seeds)
+    return [*populations, *(one for found in egos for one in found)]
 
 
 def list_egos(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
-    """An ego for each of the paper's methods."""
-    return train_egos(budget, seeds, TEACHERS, ("holdout",))
+    """An ego of two levels and one of one level for each method, and one of each that all methods' populations train;
+    held out are all methods."""
+    found = []
+    for seed in seeds:
+        for ego, mark in ((EGO, ""), (ONE_LEVEL, ", one level")):
+            found += train_egos(budget, seeds, seed, [*TEACHERS, SIMULATOR], ("holdout",), ALL_TEACHERS, ego, mark)
+            found += train_egos(budget, seeds, seed, [ALL_TEACHERS], ("holdout",), ALL_TEACHERS, ego, mark)
+    return found
 
 
 def train_egos(
-    budget: Budget, seeds: Sequence[int], labels: Sequence[str], measures: tuple[str, ...]
+    budget: Budget,
+    seeds: Sequence[int],
+    seed: int,
+    teachers: Sequence[str | tuple[str, ...]],
+    measures: tuple[str, ...],
+    held_out: Sequence[str] = TEACHERS,
+    ego: str = EGO,
+    mark: str = "",
 ) -> list[WantedRun]:
-    """An ego for each label's population, held against the populations of the paper's methods of another seed."""
-    found = []
-    for place, seed in enumerate(seeds):
-        other = seeds[(place + 1) % len(seeds)] if len(seeds) > 1 else seed + 1
-        for name in budget.layouts:
-            teachers = want_runs(budget, [seed], labels, [name], [SCORES])
-            holdouts = tuple(want_runs(budget, [other], TEACHERS, [name], [SCORES]))
-            for teacher in teachers:
-                words = (f"method={EGO}", f"scale={budget.scale}")
-                found.append(WantedRun(teacher.row, words, seed, measures, teacher, holdouts))
+    """An ego for each label's population, or for those of several labels together.
+
+    Args:
+        budget: of all runs.
+        seeds: of the target.
+        seed: of the egos and of their teachers.
+        teachers: labels, or tuples of labels.
+        measures: of the egos.
+        held_out: labels; their populations are of the next one of the seeds.
+        ego: method of the egos.
+        mark: behind the name of a row.
+    """
+    other = seeds[(seeds.index(seed) + 1) % len(seeds)] if len(seeds) > 1 else seed + 1
+    words, found = (f"method={ego}", f"scale={budget.scale}"), []
+    for layout in budget.layouts:
+        holdouts = tuple(want_runs(budget, [other], held_out, [layout], [SCORES]))
+        for labels in teachers:
+            several = not isinstance(labels, str)
+            needed = tuple(want_runs(budget, [seed], labels if several else [labels], [layout], [SCORES]))
+            row = f"{'all of them' if several else needed[0].row}{mark}"
+            found.append(WantedRun(row, words, seed, measures, needed, holdouts))
     return found
 
 

@@ -88,7 +88,7 @@ class WantedRun:
         words: overrides as for `popgen run`, seed aside; of an ego those of `popgen ego train`.
         seed: of training.
         measures: names of what is measured of it (`popgen.pipelines.run_measures`).
-        teacher: the run whose population an ego is trained with; None for a population.
+        teachers: runs whose populations an ego is trained with; none for a population.
         holdouts: runs whose populations an ego is held against.
         people: the study in which simulated people play with this row's egos, in all layouts at once.
     """
@@ -97,7 +97,7 @@ class WantedRun:
     words: tuple[str, ...]
     seed: int
     measures: tuple[str, ...]
-    teacher: WantedRun | None = None
+    teachers: tuple[WantedRun, ...] = ()
     holdouts: tuple[WantedRun, ...] = ()
     people: WantedStudy | None = None
 
@@ -111,7 +111,7 @@ class WantedRun:
         """Runs that must be finished before this one is measured, in order."""
         egos = () if self.people is None else self.people.egos
         return (
-            *(() if self.teacher is None else (self.teacher,)),
+            *self.teachers,
             *self.holdouts,
             *(one for ego in egos for one in (*ego.needs, ego)),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from popgen.errors import UserError
 from popgen.reports.paper_ego_figures import EGOS
-from popgen.reports.paper_figures import CRAMPED, LAYOUT_NAMES, RENDEZVOUS, RING
+from popgen.reports.paper_figures import CRAMPED, LAYOUT_NAMES, RENDEZVOUS, RING, SIMULATOR_METHOD
 from popgen.reports.reproduction import paper_lines, run_lists
 from popgen.reports.reproduction.paper_lines import ANY_EXIT, AVERAGE, SP, TOTAL, XP
 from popgen.reports.reproduction.target_records import Budget, Column, StudyBudget, Target
@@ -144,14 +144,17 @@ TARGETS = {
             "An ego trained with XPM-WM's population does as well beside all hold-outs as with any other.",
             run_lists.list_egos,
             (
-                *(Column(f"beside {ego}", f"holdout.{ego}") for ego in EGOS),
+                *(Column(f"beside {ego}", f"holdout.{ego}") for ego in (*EGOS, SIMULATOR_METHOD)),
                 Column(AVERAGE, "holdout.average"),
                 Column("worst pair", "holdout.worst"),
             ),
             "draw_bars",
             (AVERAGE,),
             paper_lines.list_ego_lines,
-            ("A row is the method whose population trained the ego; held out are populations of the next seed.",),
+            (
+                "A row is the method whose population trained the ego; held out are populations of the next seed. "
+                "Egos are HiPT's, or have one level: the same networks and training without the second.",
+            ),
         ),
         Target(
             "curves",
