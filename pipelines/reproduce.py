@@ -81,7 +81,7 @@ def _configure_ego(pieces: Pieces, job: Job) -> RunConfig:
     from popgen.pipelines.ego_training import make_ego_config
 
     place = {"run.root": str(job.folder.parent), "run.id": job.folder.name}
-    settings = {**pieces.plan.ego_settings, **place, "run.seed": job.wanted.seed, "tracking.enabled": False}
+    settings = {**pieces.list_ego_settings(job.wanted), **place, "run.seed": job.wanted.seed, "tracking.enabled": False}
     teachers = [str(pieces.find_job(one).folder / "population") for one in job.wanted.teachers]
     return make_ego_config(job.wanted.method, teachers, settings, scale=pieces.plan.budget.scale)
 

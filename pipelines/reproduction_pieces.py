@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from popgen.config.run_config import RunConfig
+from popgen.config.run_config import RunConfig, field_names
 from popgen.durable_files import replace_file
-from popgen.methods.registry import recipe
+from popgen.methods.registry import METHODS, recipe
 from popgen.pipelines.run_batch import named
 from popgen.reports.reproduction.target_records import Budget, Record, Target, WantedRun, WantedStudy
 from popgen.reports.run_record import differences, is_finished, planned_run, read_run
@@ -143,11 +143,19 @@ class Pieces:
 
     def _make_ego_job(self, run: WantedRun) -> Job:
         folders = [self.find_job(one).folder for one in run.teachers]
-        words = (*run.words, f"seed={run.seed}", *(f"{key}={value}" for key, value in self.plan.ego_settings.items()))
+        given = (f"{key}={value}" for key, value in self.list_ego_settings(run).items())
+        words = (*run.words, f"seed={run.seed}", *given)
         own = [one.name if one.parent == self.plan.out / "runs" else str(one) for one in folders]
         digest = hashlib.sha256(" ".join((*own, *words)).encode()).hexdigest()[:8]
         more = f"-and-{len(folders) - 1}" if len(folders) > 1 else ""
         return Job(run, self.plan.out / "runs" / f"ego-{folders[0].name}{more}-{digest}", None, words)
+
+    def list_ego_settings(self, run: WantedRun) -> dict[str, Any]:
+        """Those of the plan's settings for egos that the method of this one has."""
+        from popgen.pipelines.ego_training import find_ego_method
+
+        own = set(field_names(METHODS[find_ego_method(run.method)].config))
+        return {key: value for key, value in self.plan.ego_settings.items() if key in own}
 
     # What earlier records tell
 
@@ -167,7 +175,8 @@ class Pieces:
         teacher = self.find_job(run.teachers[0]).config
         assert teacher is not None
         config = recipe(find_ego_method(run.method), teacher.env.name, self.plan.budget.scale)
-        given = [dict(self.plan.ego_settings)] if self.plan.ego_settings else []
+        settings = self.list_ego_settings(run)
+        given = [settings] if settings else []
         return [list(run.words), _describe_run(config), *given]
 
     def _find_recorded(self, target: Target) -> dict[WantedRun, dict[str, Any]]:

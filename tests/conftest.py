@@ -39,8 +39,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too. What takes long comes
-    first, so that no worker ends alone with it (`--no-loadscope-reorder` keeps this order)."""
+    """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too. What takes long
+    comes first, so that no worker ends alone with it (`--no-loadscope-reorder` keeps this order)."""
     for item in items:
         if needs_ray(item):
             item.add_marker(pytest.mark.ray)

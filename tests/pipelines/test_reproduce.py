@@ -194,6 +194,9 @@ def test_settings_that_only_egos_have_are_of_the_egos(run: Run, monkeypatch: pyt
     assert given["ego.steps"] == 500 and "evaluation.episodes" not in given and "ego.steps=500" in ego.words
     assert teacher.config is not None and teacher.config.evaluation.episodes == 3
     assert "ego.steps=500" in work.describe_command(ego) and "ego.steps=500" not in work.describe_command(teacher)
+    work = plan_pieces("ego", "hipt.skills=3", "--budget", "smoke")
+    words = {job.wanted.method: "hipt.skills=3" in job.words for job in work.jobs.values() if job.config is None}
+    assert words == {"hipt": True, "fcp": False}  # one level has none
     code, _, err = run("reproduce", "ego", "ego.steps=many", "--budget", "smoke")
     assert code == 2 and "ego.steps" in err
 
