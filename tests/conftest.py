@@ -25,7 +25,6 @@ for _name, _value in {
 
 ROOT = Path(__file__).resolve().parent.parent
 WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line
-LONG = ("test_overcooked_oracle.py", "test_reproduce.py", "test_compare.py", "test_supervisor.py", "test_run_report.py")
 
 
 gc.disable()  # until all tests are imported: what they and their libraries are made of is never garbage
@@ -39,14 +38,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too. What takes long
-    comes first, so that no worker ends alone with it (`--no-loadscope-reorder` keeps this order)."""
+    """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too."""
     for item in items:
         if needs_ray(item):
             item.add_marker(pytest.mark.ray)
         group = "ray" if item.get_closest_marker("ray") else item.path.relative_to(ROOT).as_posix()
         item.add_marker(pytest.mark.xdist_group(group))
-    items.sort(key=lambda item: (item.get_closest_marker("ray") is None, item.path.name not in LONG))
 
 
 def needs_ray(item: pytest.Item) -> bool:
