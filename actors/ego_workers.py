@@ -44,7 +44,8 @@ class NamedMembers:
 
 
 def read_partner(text: str) -> NamedMembers:
-    """PATH, or PATH:1,3 for some members only.
+    """PATH, or PATH:1,3 for some members only. Of members with the same weights PATH means the first: FCP's half
+    trained checkpoint is the final one where nothing was learned.
 
     Raises:
         UserError: no population, or no such member.
@@ -54,7 +55,7 @@ def read_partner(text: str) -> NamedMembers:
         path, numbers = text, ""
     population = load_population(path)
     everyone = range(1, len(population) + 1)
-    members = tuple(int(number) for number in numbers.split(",") if number) or tuple(everyone)
+    members = tuple(int(number) for number in numbers.split(",") if number) or _list_distinct(population)
     if wrong := [member for member in members if member not in everyone]:
         raise UserError("ego.partners", f"{path} has no member {wrong[0]}", f"it has {len(population)}")
     if not members:
@@ -63,6 +64,14 @@ def read_partner(text: str) -> NamedMembers:
         raise UserError("ego.partners", f"{text} names a member twice", "name each once")
     data = (population.path / MANIFEST).read_bytes()
     return NamedMembers(population, members, hashlib.sha256(data).hexdigest())
+
+
+def _list_distinct(population: Population) -> tuple[int, ...]:
+    """Members whose weights no earlier one has."""
+    weights = [population.info(member).policy_sha256 for member in range(1, len(population) + 1)]
+    return tuple(
+        member for member, own in enumerate(weights, 1) if own == NO_WEIGHTS or own not in weights[: member - 1]
+    )
 
 
 def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:

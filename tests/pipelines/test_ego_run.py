@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from support.small import kitchen
 
-from popgen.actors.ego_workers import open_training
+from popgen.actors.ego_workers import open_training, read_partner
 from popgen.errors import UserError
 from popgen.methods.ego.config import EgoRun
 from popgen.methods.training import InlineTransport
@@ -120,6 +120,22 @@ def test_what_cannot_be_trained_is_told_in_one_line(partners: Path) -> None:
         with pytest.raises(UserError) as caught:
             preflight(make_ego_config(method, named, {**SETTINGS, **settings}, scale="smoke"))
         assert caught.value.field == field
+
+
+def test_a_population_means_each_of_its_policies_once(tmp_path: Path) -> None:
+    """A half trained checkpoint may be the final one; random players have no weights to be told by."""
+    spec = kitchen(horizon=40).spec
+    writer = PopulationWriter(tmp_path / "skills", spec, method="fcp", config_digest="a" * 64, seed=5)
+    for seed in (0, 1, 1):
+        policy = FeedForwardPolicy(spec.views["features"], spec.num_actions, units=4, layers=1, seed=seed)
+        writer.add_member(policy, seed=seed, steps={})
+    for _ in range(2):
+        writer.add_member(RandomPolicy(spec.num_actions), seed=9, steps={})
+    assert read_partner(str(tmp_path / "skills")).members == (1, 2, 4, 5)
+    config = make_ego_config("fcp", [str(tmp_path / "skills")], SETTINGS, scale="smoke")
+    preflight(config)
+    with pytest.raises(UserError, match="a member twice"):
+        preflight(make_ego_config("fcp", [f"{tmp_path / 'skills'}:2,3"], SETTINGS, scale="smoke"))
 
 
 def test_partners_that_changed_are_refused(partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
