@@ -3,8 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# One worker of pytest-xdist for all that starts Ray, the other for the rest.
-PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 export RAY_USAGE_STATS_ENABLED := 0
 export MLFLOW_DISABLE_TELEMETRY := true
 # Without its cache every process compiles the code and the tests anew: a third of the time before the first test.
@@ -21,8 +20,8 @@ demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 test: install  ## all tests
 	$(PYTEST)
 
-test-fast: install  ## without Ray and whole runs (the oracle plays 2,000 steps of each layout, not 20,000)
-	POPGEN_ORACLE_STEPS=2000 $(PYTEST) -m "not ray and not end_to_end"
+test-fast: install  ## without Ray and whole runs (the oracle plays 1,000 steps of each layout, not 20,000)
+	POPGEN_ORACLE_STEPS=1000 $(PYTEST) -m "not ray and not end_to_end"
 
 lint: install docs types  ## style, types and documentation
 	$(BIN)/ruff check .

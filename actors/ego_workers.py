@@ -22,10 +22,10 @@ from popgen.methods.ego.partner_source import PartnerSource
 from popgen.methods.ego.train import EgoTraining
 from popgen.methods.ego.workers import Iterations
 from popgen.methods.training import Pending, Place, State, Transport
-from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.population import Population, check_compatible, load_population
 from popgen.population.store import MANIFEST
+from popgen.types import Weights
 
 
 @dataclass(frozen=True)

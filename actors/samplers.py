@@ -13,11 +13,10 @@ from popgen.config.sections import EnvConfig
 from popgen.envs import EnvSpec, make_env
 from popgen.errors import UserError
 from popgen.methods.training import Collected, Pending, Place, PolicySnapshot, Sampled, SegmentCount, Transport, Worker
-from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.play.rollout import Match, Sampler, split_matches
 from popgen.policies.policy_registry import build_policy
-from popgen.types import Kind, Segment
+from popgen.types import Kind, Segment, Weights
 
 
 @runtime_checkable

@@ -18,8 +18,9 @@ from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.restart_check import restart_check
 from popgen.methods.xpm_sim.train import XpmSimTraining
 from popgen.methods.xpm_sim.workers import Learned, RestartCheck
-from popgen.nets.weights import Weights, weights_of
+from popgen.nets.weights import weights_of
 from popgen.play.rollout import Match
+from popgen.types import Weights
 
 ENVS = 64
 """Environments from which start states are drawn at once."""

@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 
+Weights = dict[str, np.ndarray]
+"""A network's weights by name: what travels between processes and into safetensors."""
+
 
 class Kind(StrEnum):
     """What an environment step was spent on; each has its own column in the ledger."""

@@ -24,6 +24,9 @@ for _name, _value in {
     os.environ.setdefault(_name, _value)
 
 ROOT = Path(__file__).resolve().parent.parent
+IN_MEMORY = Path("/dev/shm")  # tests sync and remove thousands of small files: on a disk a fifth of their time
+if IN_MEMORY.is_dir() and shutil.disk_usage(IN_MEMORY).free > 4 * 2**30:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(IN_MEMORY))
 WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line
 
 
@@ -36,14 +39,11 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs Ray; keep it in one worker of pytest-xdist, and every other file in one too."""
+    """Mark what needs Ray."""
     for item in items:
         if needs_ray(item):
             item.add_marker(pytest.mark.ray)
-        group = "ray" if item.get_closest_marker("ray") else item.path.relative_to(ROOT).as_posix()
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 def needs_ray(item: pytest.Item) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -104,6 +106,15 @@ def test_heavy_packages_stay_in_their_places(package: str) -> None:
     used = {owner for owner in owners if any(path.is_relative_to(owner) for path in users)}
     strangers = [path for path in users if not any(path.is_relative_to(owner) for owner in owners)]
     assert used == set(owners) and not strangers
+
+
+@pytest.mark.parametrize(
+    "module", ["popgen.methods.xpm_wm.replay", "popgen.actors.samplers", "popgen.actors.tracker_actor", "popgen.cli"]
+)
+def test_processes_that_learn_nothing_load_no_torch(module: str) -> None:
+    """It takes each of them seconds and 200 MB; a sampler loads it with its first policy that is a network."""
+    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
 def test_the_reader_of_imports_sees_every_form(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

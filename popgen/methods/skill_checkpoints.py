@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from popgen.methods.training import State
-from popgen.nets.weights import Weights
+from popgen.types import Weights
 
 KEPT = 16
 """Candidates for the policies between the first and the last."""

@@ -26,10 +26,9 @@ from typing import Any, Concatenate, Generic, NamedTuple, ParamSpec, Protocol, T
 
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
-from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.policy import Policy
-from popgen.types import Kind, Segment
+from popgen.types import Kind, Segment, Weights
 
 State = dict[str, Any]
 """Nested dictionaries of arrays and plain values, as `popgen.runs.state_files` writes them. In a checkpoint a `Pending`

@@ -1,4 +1,4 @@
-"""Weights as plain numpy dictionaries: what travels between processes and into safetensors."""
+"""Networks' weights as plain numpy dictionaries, and back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-Weights = dict[str, np.ndarray]
+from popgen.types import Weights
+
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's, in its own words
 
 

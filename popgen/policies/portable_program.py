@@ -36,7 +36,7 @@ import safetensors.numpy
 import torch
 from torch import nn
 
-from popgen.nets.weights import Weights
+from popgen.types import Weights
 
 ACTIVATION_NAMES: Mapping[type[nn.Module], str] = {nn.Tanh: "tanh", nn.LeakyReLU: "leaky_relu", nn.SiLU: "silu"}
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from popgen.envs.contract import EnvSpec
-from popgen.policies.portable_program import Program, write_constant
 from popgen.types import check_reset
+
+if TYPE_CHECKING:
+    from popgen.policies.portable_program import Program
 
 
 def _no_weights(weights: Mapping[str, np.ndarray]) -> None:
@@ -64,6 +66,8 @@ class RandomPolicy:
 
     def to_program(self) -> Program:
         """See `popgen.policies.portable_program.Portable`."""
+        from popgen.policies.portable_program import write_constant  # needs torch, which random play does not
+
         shares = np.array(self.probabilities or [1.0] * self.num_actions)
         with np.errstate(divide="ignore"):
             return write_constant(np.log(shares).tolist())
@@ -111,6 +115,8 @@ class IdlePolicy:
 
     def to_program(self) -> Program:
         """See `popgen.policies.portable_program.Portable`."""
+        from popgen.policies.portable_program import write_constant  # needs torch, which random play does not
+
         return write_constant([0.0 if action == self._index else -np.inf for action in range(self._num_actions)])
 
     def config(self) -> dict[str, Any]:

@@ -248,10 +248,8 @@ def mixed_play_sheet(report: Mapping[str, Any]) -> Sheet | None:
     if not cells:
         return None
     memory = " with memory kept and reset" if remember else ""
-    title = (
-        f"share of ordinary self-play after cross-play, by seat{memory}; least of its partners; "
-        "and that of a new game of as many steps"
-    )
+    title = f"share of ordinary self-play after cross-play, by seat{memory}; least of its partners"
+    title += "; and that of a new game of as many steps" if "new game" in cells[0] else ""
     return Sheet(title, pd.DataFrame(cells))
 
 

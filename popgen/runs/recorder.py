@@ -18,7 +18,6 @@ from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.jsonable import unique
 from popgen.methods.training import Collected, StepCount
-from popgen.nets.weights import Weights
 from popgen.play.policy import Policy
 from popgen.population import PopulationWriter, load_population
 from popgen.population.manifest import MemberInfo
@@ -41,7 +40,7 @@ from popgen.runs.sinks import (
     TrackerClient,
 )
 from popgen.runs.storage import Mirror
-from popgen.types import POPULATION, TRAINING_KINDS, Kind, LedgerEntry
+from popgen.types import POPULATION, TRAINING_KINDS, Kind, LedgerEntry, Weights
 
 
 class RunRecorder:

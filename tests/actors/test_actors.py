@@ -8,12 +8,11 @@ import torch
 from support.small import kitchen, random_play
 
 from popgen.actors.samplers import SamplerActor
-from popgen.actors.xpm_wm_workers import ReplayActor
 from popgen.config.sections import EnvConfig
 from popgen.methods.training import InlineTransport, PolicySnapshot, Ready
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
-from popgen.methods.xpm_wm.replay import Query, Request
+from popgen.methods.xpm_wm.replay import Query, ReplayActor, Request
 from popgen.play.rollout import Match
 from popgen.types import RANDOM_MEMBER, Kind
 

@@ -27,7 +27,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 
 
 def test_a_killed_sweep_goes_on_and_keeps_what_is_finished(tmp_path: Path) -> None:
-    words = ("method=xpm_sim", "seed=1,2", "xpm_sim.updates=2,4")
+    words = ("method=xpm_sim", "seed=1,2", "xpm_sim.updates=2")
     first = start(tmp_path, *words)
     runs, deadline = tmp_path / "sweep" / "runs", time.time() + LIMIT
     while not (done := list(runs.glob("*/report/crossplay.json"))):
@@ -38,10 +38,7 @@ def test_a_killed_sweep_goes_on_and_keeps_what_is_finished(tmp_path: Path) -> No
     before = {path: path.stat().st_mtime_ns for path in done}
     out, err = start(tmp_path, *words).communicate(timeout=LIMIT)
     report = json.loads(out)
-    assert len(report["runs"]) == 4 and report["missing"] == [], err
-    assert [(group["settings"], group["seeds"]) for group in report["groups"]] == [
-        ({"xpm_sim.updates": 2}, [1, 2]),
-        ({"xpm_sim.updates": 4}, [1, 2]),
-    ]
+    assert len(report["runs"]) == 2 and report["missing"] == [], err
+    assert [(group["settings"], group["seeds"]) for group in report["groups"]] == [({}, [1, 2])]
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert (tmp_path / "sweep" / "sweep.md").read_text().count("XPM-Sim xpm_sim.updates=") >= 2
+    assert (tmp_path / "sweep" / "sweep.md").read_text().count("XPM-Sim") >= 1

@@ -25,9 +25,10 @@ from popgen.methods.ego.ego_rollout import Choices, Company, EgoSampler, EndedEp
 from popgen.methods.ego.partner_seats import PartnerSeats
 from popgen.methods.ego.two_levels import advantages_of_decisions, cut_segments, information_of_skill, pay_segments
 from popgen.nets.feed_forward import Sizes, ValueNet
-from popgen.nets.weights import Weights, load_optimiser_state, load_weights, optimiser_state, weights_of
+from popgen.nets.weights import load_optimiser_state, load_weights, optimiser_state, weights_of
 from popgen.play.policy import Policy
 from popgen.play.stacked_partners import PartnerPool
+from popgen.types import Weights
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.ego.ego_networks import EgoSizes, build_network
 from popgen.methods.ego.two_levels import draw_durations
 from popgen.nets.blocks import draw_by_gumbel
-from popgen.nets.weights import Weights, load_weights, weights_of
+from popgen.nets.weights import load_weights, weights_of
 from popgen.policies.portable_program import Program, ProgramWriter
-from popgen.types import check, check_reset
+from popgen.types import Weights, check, check_reset
 
 _GRU_PARTS = ("weight_ih", "bias_ih", "weight_hh", "bias_hh")
 

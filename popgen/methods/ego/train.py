@@ -32,8 +32,8 @@ from popgen.methods.training import (
     StepCount,
     TrainedMember,
 )
-from popgen.nets.weights import Weights, prefixed
-from popgen.types import Kind
+from popgen.nets.weights import prefixed
+from popgen.types import Kind, Weights
 
 ROUND = 50_000
 """Environment steps between two records, at least."""

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from popgen.methods.ego.ego_rollout import EndedEpisode
 from popgen.methods.training import Figures, Pending, State
-from popgen.nets.weights import Weights
+from popgen.types import Weights
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from popgen.methods.mappo.rl_module import module_id, module_spec, spaces
 from popgen.methods.mappo.slots import Actor, Rollout, SlotPool
 from popgen.methods.mappo.training_job import Job, sizes_of
 from popgen.nets.feed_forward import FeedForwardNet
-from popgen.nets.weights import Weights, load_weights
+from popgen.nets.weights import load_weights
 from popgen.play.rollout import Match, share_of_each
+from popgen.types import Weights
 
 
 @dataclass(frozen=True)

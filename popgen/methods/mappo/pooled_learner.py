@@ -20,8 +20,9 @@ from popgen.methods.mappo.pooling import Plan, PooledBatch, pool
 from popgen.methods.mappo.population_bonus import joint_log_probs
 from popgen.methods.mappo.rl_module import CRITICS, MemberModule, module_id
 from popgen.methods.mappo.slots import Rollout
-from popgen.nets.weights import Weights, load_optimiser_state, load_weights, optimiser_state, weights_of
+from popgen.nets.weights import load_optimiser_state, load_weights, optimiser_state, weights_of
 from popgen.play.trajectories import Trajectories
+from popgen.types import Weights
 
 NETWORKS = ("actor", CRITICS)
 """Parts of a module, each with an optimiser and a gradient norm of its own."""

@@ -37,9 +37,9 @@ from popgen.methods.training import (
     TrainedMember,
     Transport,
 )
-from popgen.nets.weights import Weights, prefixed
+from popgen.nets.weights import prefixed
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
-from popgen.types import Kind
+from popgen.types import Kind, Weights
 
 SCORES = ("sp", "xp")
 """Figures of whole episodes, `real_...` in the metrics; an iteration lacks them until some have ended."""

@@ -11,9 +11,8 @@ from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.methods.mappo.hidden_utility import Utility
 from popgen.methods.mappo.population_bonus import PopulationBonus
 from popgen.nets.feed_forward import Sizes
-from popgen.nets.weights import Weights
 from popgen.play.rollout import Match
-from popgen.types import Kind
+from popgen.types import Kind, Weights
 
 
 @dataclass(frozen=True)

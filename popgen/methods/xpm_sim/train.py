@@ -36,10 +36,10 @@ from popgen.methods.xpm_sim.agent import make_actor
 from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.round_rules import MemberProgress, round_matches, score_round, seatings, updates_of_round
 from popgen.methods.xpm_sim.workers import Learned, Workers
-from popgen.nets.weights import Weights, prefixed
+from popgen.nets.weights import prefixed
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
-from popgen.types import Kind
+from popgen.types import Kind, Weights
 
 SIMULATED_PLAY = "simulated play"
 STEP_SECONDS = 5e-5  # of a simulated step and what is learned from it, on a laptop's core

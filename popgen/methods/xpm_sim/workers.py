@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from popgen.methods.training import Figures, Pending, PolicySnapshot, Sampled, Segments, State
-from popgen.nets.weights import Weights
 from popgen.play.rollout import Match
+from popgen.types import Weights
 
 
 @dataclass(frozen=True)

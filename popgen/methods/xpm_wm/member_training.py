@@ -15,8 +15,9 @@ from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
 from popgen.methods.xpm_wm.real_play import Candidate, Tally, goes_by_tally
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import Setup, Workers
-from popgen.nets.weights import Weights, same_form
+from popgen.nets.weights import same_form
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
+from popgen.types import Weights
 
 ROW_SECONDS, IMAGINED_SECONDS, STEP_SECONDS, FIT_SECONDS = 8e-5, 6.5e-5, 5e-6, 1.2e-5
 """On a laptop's core: of a row that the world model learns from, of an imagined step, of an environment step, of an

@@ -15,8 +15,8 @@ from popgen.methods.training import Pending, Phase, Progress, Round, Sampled, St
 from popgen.methods.xpm_wm.config import Phase1Config
 from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Put, Watch
 from popgen.methods.xpm_wm.world_model import Starts
-from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
+from popgen.types import Weights
 
 RANDOM_PLAY, MODEL_ALONE, SELF_PLAY = "random play", "world model", "self-play"
 CONFIRMED = 0.97

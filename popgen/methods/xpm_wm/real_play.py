@@ -1,5 +1,5 @@
 """Real play: who plays in the real environments, policies as they travel to samplers, and what play has shown: of a
-policy, of the world, and of the imagination beside it."""
+policy, of the world, and of the imagination beside it. No torch here: the replay actors load this."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ import numpy as np
 from popgen.envs.contract import BatchedEnv, EnvSpec, ViewSpec
 from popgen.methods.training import Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.config import DiscoveryConfig, WatchConfig, WorldModelRun
-from popgen.nets.weights import Weights
 from popgen.play.episodes import Episode
 from popgen.play.rollout import Match
 from popgen.policies.simple_policies import RandomPolicy
-from popgen.types import RANDOM_MEMBER, Kind, Segment
+from popgen.types import RANDOM_MEMBER, Kind, Segment, Weights
 
 Pair = tuple[int, int]
 

@@ -2,6 +2,7 @@
 
 A row is one transition (s_t, a_t, e_{t+1}); where an episode terminated, one more row holds the terminal state.
 Rows of one environment lie contiguously in a *stream*; a window never crosses streams.
+No torch here: the actors that hold the buffers would load it for nothing.
 """
 
 from __future__ import annotations
@@ -11,8 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from popgen.config.sections import EnvConfig
+from popgen.envs import make_env
 from popgen.envs.contract import BatchedEnv, EnvSpec
+from popgen.methods.training import Pending
 from popgen.methods.xpm_wm.config import WorldModelRun
+from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper
 from popgen.types import Kind, Segment
 
 KIND_CODE = {kind: code for code, kind in enumerate(Kind)}
@@ -370,3 +375,61 @@ def start_batch(config: WorldModelRun, spec: EnvSpec, member: int, windows: int)
             Request(Query(owner=member, kind=Kind.XP), windows // 2 if meets else 0, pool=NEW_XP),
         ),
     )
+
+
+class ReplayActor:
+    """Takes segments once each, serves encoded windows, and tells what it has taken in.
+
+    Args:
+        counted: view whose players' own states are counted; "" for none.
+    """
+
+    def __init__(self, env: EnvConfig, capacity: int, seed: int, counted: str = "") -> None:
+        self.replay = Replay(make_env(env.name, 1, **env.params), capacity, seed)
+        self.keeper = TallyKeeper(self.replay.env, counted)
+        self.seen: set[tuple[str, int]] = set()
+        self.turn = 0
+
+    def ingest(self, segments: Pending[list[Segment]], owner: int) -> int:
+        """Store segments; a retried call adds nothing. Returns the rows held."""
+        for segment in segments.result():
+            key = (segment.sampler, segment.sequence)
+            if key not in self.seen:
+                self.seen.add(key)
+                self.replay.add(segment, owner)
+                self.keeper.add(segment, owner)
+        return self.replay.size
+
+    def draw(self, requests: tuple[Request, ...], length: int, view: str, repeats: int) -> list[list[Windows | None]]:
+        """For each of `repeats` updates, the windows of every request (None where nothing matches)."""
+        drawn = []
+        for _ in range(repeats):
+            drawn.append([draw(self.replay, request, length, view, self.turn) for request in requests])
+            self.turn += 1
+        return drawn
+
+    def tally(self, owner: int) -> Tally:
+        """Of all segments so far, with `owner` as the present member."""
+        return self.keeper.tally(owner)
+
+    def state(self) -> dict[str, Any]:
+        """Contents, counters and generator."""
+        seen = sorted([list(key) for key in self.seen])
+        return {"replay": self.replay.state(), "seen": seen, "turn": self.turn, "tally": self.keeper.state()}
+
+    def marks(self) -> dict[str, Any]:
+        """What `state` holds beside the contents: small enough for every iteration."""
+        return {"rng": self.replay.rng.bit_generator.state, "turn": self.turn}
+
+    def load_marks(self, marks: dict[str, Any]) -> None:
+        """Draw on from `marks()`, with contents that were added again."""
+        self.replay.rng.bit_generator.state = marks["rng"]
+        self.turn = int(marks["turn"])
+
+    def load_state(self, state: Pending[dict[str, Any]]) -> None:
+        """Continue from `state()`."""
+        contents = state.result()
+        self.replay.load_state(contents["replay"])
+        self.seen = {(str(name), int(number)) for name, number in contents["seen"]}
+        self.turn = int(contents["turn"])
+        self.keeper.load_state(contents["tally"])

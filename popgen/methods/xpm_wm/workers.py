@@ -11,8 +11,8 @@ from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled
 from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.real_play import MemberWeights, Tally
 from popgen.methods.xpm_wm.world_model import Starts
-from popgen.nets.weights import Weights
 from popgen.play.rollout import Match
+from popgen.types import Weights
 
 
 @dataclass(frozen=True)

@@ -149,18 +149,19 @@ def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     labels = [name for name, method in METHODS.items() if not method.trains_ego]
     measures = [SCORES, COSTS, "diversity", "acting", "conventions"]
     populations = want_runs(budget, seeds, labels, budget.layouts, measures)
-    egos = (train_egos(budget, seeds, seed, labels, ("holdout", "human")) for seed in seeds)
+    teachers = [(label,) for label in labels]
+    egos = (train_egos(budget, seeds, seed, teachers, ("holdout", "human")) for seed in seeds)
     return [*populations, *(one for found in egos for one in found)]
 
 
 def list_egos(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     """An ego of two levels and one of one level for each method, and one of each that all methods' populations train;
     held out are all methods."""
+    teachers = [*((name,) for name in (*TEACHERS, SIMULATOR)), ALL_TEACHERS]
     found = []
     for seed in seeds:
         for ego, mark in ((EGO, ""), (ONE_LEVEL, ", one level")):
-            found += train_egos(budget, seeds, seed, [*TEACHERS, SIMULATOR], ("holdout",), ALL_TEACHERS, ego, mark)
-            found += train_egos(budget, seeds, seed, [ALL_TEACHERS], ("holdout",), ALL_TEACHERS, ego, mark)
+            found += train_egos(budget, seeds, seed, teachers, ("holdout",), ALL_TEACHERS, ego, mark)
     return found
 
 
@@ -168,19 +169,19 @@ def train_egos(
     budget: Budget,
     seeds: Sequence[int],
     seed: int,
-    teachers: Sequence[str | tuple[str, ...]],
+    teachers: Sequence[Sequence[str]],
     measures: tuple[str, ...],
     held_out: Sequence[str] = TEACHERS,
     ego: str = EGO,
     mark: str = "",
 ) -> list[WantedRun]:
-    """An ego for each label's population, or for those of several labels together.
+    """Egos of one seed, beside populations that they never met.
 
     Args:
         budget: of all runs.
         seeds: of the target.
         seed: of the egos and of their teachers.
-        teachers: labels, or tuples of labels.
+        teachers: labels of those that train one ego together, for each ego.
         measures: of the egos.
         held_out: labels; their populations are of the next one of the seeds.
         ego: method of the egos.
@@ -191,10 +192,9 @@ def train_egos(
     for layout in budget.layouts:
         holdouts = tuple(want_runs(budget, [other], held_out, [layout], [SCORES]))
         for labels in teachers:
-            several = not isinstance(labels, str)
-            needed = tuple(want_runs(budget, [seed], labels if several else [labels], [layout], [SCORES]))
-            row = f"{'all of them' if several else needed[0].row}{mark}"
-            found.append(WantedRun(row, words, seed, measures, needed, holdouts))
+            needed = tuple(want_runs(budget, [seed], labels, [layout], [SCORES]))
+            row = needed[0].row if len(needed) == 1 else "all of them"
+            found.append(WantedRun(f"{row}{mark}", words, seed, measures, needed, holdouts))
     return found
 
 

@@ -14,9 +14,9 @@ from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.methods.mappo.rl_module import module_spec
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
-from popgen.nets.weights import Weights, weights_of
+from popgen.nets.weights import weights_of
 from popgen.play.rollout import Match
-from popgen.types import Kind
+from popgen.types import Kind, Weights
 
 # A small arena, which players soon leave: an episode's end.
 ENV = EnvConfig(name="rendezvous/mppmr", params={"horizon": 30, "bounds": 0.8, "start_noise": 0.2, "sensitivity": 8.0})

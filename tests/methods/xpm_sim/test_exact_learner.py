@@ -15,7 +15,8 @@ from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.critics import SELF, SHARED
 from popgen.methods.xpm_sim.restart_check import restart_check
 from popgen.methods.xpm_sim.simulation import Partner
-from popgen.nets.weights import Weights, weights_of
+from popgen.nets.weights import weights_of
+from popgen.types import Weights
 
 SMALL = XpmSimConfig(
     units=16,

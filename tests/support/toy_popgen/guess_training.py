@@ -20,9 +20,8 @@ from popgen.methods.training import (
     TrainedMember,
     Transport,
 )
-from popgen.nets.weights import Weights
 from popgen.play.rollout import Match
-from popgen.types import Kind
+from popgen.types import Kind, Weights
 
 
 class GuessTraining:
