@@ -20,8 +20,8 @@ demo: install  ## a population of two in the cramped room, with its SP/XP matrix
 test: install  ## all tests
 	$(PYTEST)
 
-test-fast: install  ## without Ray and whole runs (the oracle plays 1,000 steps of each layout, not 20,000)
-	POPGEN_ORACLE_STEPS=1000 $(PYTEST) -m "not ray and not end_to_end"
+test-fast: install  ## without Ray and whole runs (the oracle plays 2,000 steps of each layout, not 20,000)
+	POPGEN_ORACLE_STEPS=2000 $(PYTEST) -m "not ray and not end_to_end"
 
 lint: install docs types  ## style, types and documentation
 	$(BIN)/ruff check .

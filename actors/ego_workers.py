@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.envs.contract import EnvSpec
@@ -21,7 +17,7 @@ from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
 from popgen.methods.ego.partner_source import PartnerSource
 from popgen.methods.ego.train import EgoTraining
 from popgen.methods.ego.workers import Iterations
-from popgen.methods.training import Pending, Place, State, Transport
+from popgen.methods.training import Pending, Place, State, Transport, UpdateFigures
 from popgen.play.policy import Policy
 from popgen.population import Population, check_compatible, load_population
 from popgen.population.store import MANIFEST
@@ -130,7 +126,7 @@ class EgoActor:
 
     @property
     def learner(self) -> EgoLearner:
-        """The running ego's.
+        """The learner of the running ego.
 
         Raises:
             RuntimeError: none has begun.
@@ -148,16 +144,13 @@ class EgoActor:
 
     def iterate(self, count: int) -> Iterations:
         """So many rollouts with their updates."""
-        cpu, steps, episodes = time.process_time(), 0, []
-        began, totals = time.perf_counter(), defaultdict(list)
+        figures, steps, episodes = UpdateFigures(), 0, []
         for _ in range(count):
-            figures, played, ended = self.learner.iterate()
+            iteration, played, ended = self.learner.iterate()
             steps, episodes = steps + played, episodes + ended
-            for name, value in figures.items():
-                totals[name].append(value)
-        means = {name: float(np.mean(values)) for name, values in totals.items()}
-        means["steps_per_second"] = steps / (time.perf_counter() - began)
-        return Iterations(means, steps, episodes, time.process_time() - cpu)
+            figures.add(iteration)
+        means = figures.means() | {"steps_per_second": steps / figures.seconds()}
+        return Iterations(means, steps, episodes, figures.cpu_seconds())
 
     def acting(self) -> Weights:
         """The ego's weights."""
@@ -168,7 +161,7 @@ class EgoActor:
         return self.learner.training_weights()
 
     def state(self) -> dict[str, Any]:
-        """Of the learner and the running episodes."""
+        """Collect the state of the learner and the running episodes."""
         return self.learner.state()
 
     def load_state(self, state: State) -> None:
@@ -184,27 +177,27 @@ class EgoWorkers:
         self.learner = transport.start(EgoActor, Place(cluster.agent_cpus), config, cluster.threads)
 
     def begin_member(self, seed: int) -> Pending[None]:
-        """The learner's."""
+        """Have the learner begin with an ego."""
         return self.learner.ask(EgoActor.begin_member, seed)
 
     def iterate(self, count: int) -> Pending[Iterations]:
-        """The learner's."""
+        """Ask the learner for so many rollouts with their updates."""
         return self.learner.ask(EgoActor.iterate, count)
 
     def acting(self) -> Pending[Weights]:
-        """The learner's."""
+        """Ask the learner for the ego's weights."""
         return self.learner.ask(EgoActor.acting)
 
     def critics(self) -> Pending[Weights]:
-        """The learner's."""
+        """Ask the learner for its critics' weights."""
         return self.learner.ask(EgoActor.critics)
 
     def state(self) -> Pending[State]:
-        """The learner's."""
+        """Ask the learner for its state and that of the running episodes."""
         return self.learner.ask(EgoActor.state)
 
     def load_state(self, state: State) -> None:
-        """The learner's."""
+        """Load a state into the learner and wait until it is there."""
         self.learner.ask(EgoActor.load_state, state).result()
 
     def end(self) -> None:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.actors.samplers import start_samplers
 from popgen.envs.contract import EnvSpec
-from popgen.methods.training import Pending, Place, PolicySnapshot, Sampled, Segments, State, Transport
+from popgen.methods.training import Pending, Place, PolicySnapshot, Sampled, Segments, State, Transport, UpdateFigures
 from popgen.methods.xpm_sim.agent import XpmSimLearner
 from popgen.methods.xpm_sim.config import XpmSimRun
 from popgen.methods.xpm_sim.restart_check import restart_check
@@ -37,7 +33,7 @@ class SimulatedAgentActor:
 
     @property
     def learner(self) -> XpmSimLearner:
-        """The running member's.
+        """The learner of the running member.
 
         Raises:
             RuntimeError: no member has begun.
@@ -66,20 +62,17 @@ class SimulatedAgentActor:
 
     def learn(self, updates: int) -> Learned:
         """Simulate and update `updates` times."""
-        began, cpu, learner = time.perf_counter(), time.process_time(), self.learner
+        figures, learner = UpdateFigures(), self.learner
         steps, trajectories = learner.simulated, learner.trajectories
-        totals: dict[str, list[float]] = defaultdict(list)
         for _ in range(updates):
-            for name, value in learner.update().items():
-                totals[name].append(value)
-        means = {name: float(np.mean(values)) for name, values in totals.items()}
-        means["update_ms"] = 1e3 * (time.perf_counter() - began) / updates
-        means["cpu_seconds"] = time.process_time() - cpu
+            figures.add(learner.update())
+        times = figures.times(updates)
+        means = figures.means() | {name: times[name] for name in ("update_ms", "cpu_seconds")}
         acting = self.transport.put(learner.actor.weights())
         return Learned(acting, means, learner.simulated - steps, learner.trajectories - trajectories)
 
     def check(self) -> RestartCheck:
-        """See `restart_check`."""
+        """Check restarts; see `restart_check`."""
         return RestartCheck(*restart_check(self.learner, self.config.xpm_sim.check_pairs))
 
     def encoder(self) -> State | None:
@@ -91,7 +84,7 @@ class SimulatedAgentActor:
         return weights_of(self.learner.critics)
 
     def state(self) -> dict[str, Any]:
-        """Of the learner, its buffers and running trajectories."""
+        """Collect the state of the learner, its buffers and running trajectories."""
         return self.learner.state()
 
     def load_state(self, state: Pending[State]) -> None:
@@ -109,48 +102,48 @@ class XpmSimWorkers:
         self.learner = transport.start(SimulatedAgentActor, place, config, cluster.threads, transport)
 
     def put(self, weights: Weights) -> Pending[Weights]:
-        """Into the transport's store."""
+        """Put weights into the transport's store."""
         return self.transport.put(weights)
 
     def begin_member(
         self, member: int, seed: int, partners: Mapping[int, Pending[Weights]], encoder: Pending[State | None] | None
     ) -> Pending[Weights]:
-        """The learner's."""
+        """Have the learner begin with a member; its fresh acting weights."""
         return self.learner.ask(SimulatedAgentActor.begin_member, member, seed, dict(partners), encoder)
 
     def play(self, matches: list[Match], policies: dict[int, PolicySnapshot], seed: int, steps: int) -> list[Sampled]:
-        """All samplers at the same time; segments stay where they are."""
+        """Let all samplers play at the same time; segments stay where they are."""
         self.samplers.open(matches, policies, seed)
         return self.samplers.collect(steps)
 
     def ingest(
         self, segments: list[Segments], strength: dict[int, float], multipliers: dict[int, float]
     ) -> Pending[None]:
-        """Segments go from the samplers' store to the learner."""
+        """Send segments from the samplers' store to the learner."""
         return self.learner.ask(SimulatedAgentActor.ingest, segments, strength, multipliers)
 
     def learn(self, updates: int) -> Pending[Learned]:
-        """The learner's."""
+        """Ask the learner for updates."""
         return self.learner.ask(SimulatedAgentActor.learn, updates)
 
     def check(self) -> Pending[RestartCheck]:
-        """The learner's."""
+        """Ask the learner how self-play does from states of cross-play and from its own."""
         return self.learner.ask(SimulatedAgentActor.check)
 
     def critics(self) -> Pending[Weights]:
-        """The learner's."""
+        """Ask the learner for its critics' weights."""
         return self.learner.ask(SimulatedAgentActor.critics)
 
     def encoder(self) -> Pending[State | None]:
-        """The learner's."""
+        """Ask the learner for the shared encoder's state."""
         return self.learner.ask(SimulatedAgentActor.encoder)
 
     def state(self) -> State:
-        """Handles of the learner's state and of the samplers'."""
+        """Ask learner and samplers for their states; handles."""
         return {"learner": self.learner.ask(SimulatedAgentActor.state), "samplers": self.samplers.state()}
 
     def load_state(self, state: State) -> None:
-        """The learner's; fresh samplers have played nothing: only the running number of their segments matters."""
+        """Load the learner's state; of the fresh samplers' only the number of the next segment matters."""
         self.learner.ask(SimulatedAgentActor.load_state, self.transport.put(state["learner"])).result()
         self.samplers.load_state(state["samplers"])
 

@@ -5,8 +5,6 @@ The actors are thin: every number is made by what they hold.
 
 from __future__ import annotations
 
-import time
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +23,7 @@ from popgen.methods.training import (
     Segments,
     State,
     Transport,
+    UpdateFigures,
     Worker,
 )
 from popgen.methods.xpm_wm.actor_critic import Actor
@@ -89,9 +88,8 @@ class WorldModelActor:
     def train(self, task: ModelTask) -> ModelUpdate:
         """Gradient steps; weights, start states from the training windows and mean metrics. Weights and states stay in
         the store."""
-        began, began_cpu = time.perf_counter(), time.process_time()
         config, learner, updates = self.config.world_model, self.learner, task.updates
-        totals: dict[str, list[float]] = defaultdict(list)
+        figures = UpdateFigures()
         starts: list[Starts] = []
         for first in range(0, updates, CHUNK):
             chunk = self._draw_windows(
@@ -103,15 +101,11 @@ class WorldModelActor:
                     learner.set_biases(windows)
                     self.biased = True
                 metrics, seen = learner.update(windows)
-                for name, value in metrics.items():
-                    totals[name].append(value)
+                figures.add(metrics)
                 if count := task.starts_per_update:
                     starts.append(learner.starts(seen, windows, count, pool=OLD, chosen=task.chosen, rare=task.rare))
         recent = self._recent_starts(task.recent_rows)
-        means = {name: float(np.mean(values)) for name, values in totals.items()}
-        means["seconds"] = time.perf_counter() - began
-        means["cpu_seconds"] = time.process_time() - began_cpu
-        means["update_ms"] = 1000.0 * means["seconds"] / max(1, updates)
+        means = figures.means() | figures.times(updates)
         stored = self.transport.put(Starts.concat(starts)) if starts else None
         return ModelUpdate(self.weights(), stored, means, recent)
 
@@ -171,7 +165,7 @@ class WorldModelActor:
         return self.transport.put(weights_of(self.learner.model))
 
     def state(self) -> dict[str, Any]:
-        """Learner state."""
+        """Collect the learner's state."""
         return {"learner": self.learner.state(), "biased": self.biased}
 
     def load_state(self, state: Pending[dict[str, Any]]) -> None:
@@ -207,24 +201,20 @@ class AgentActor:
 
     def train(self, task: AgentTask) -> AgentUpdate:
         """Imagine and update; what comes of it stays in the store."""
-        began, began_cpu = time.perf_counter(), time.process_time()
+        figures = UpdateFigures()
         model, fitted = task.model.result(), task.partners.result() if task.partners is not None else None
         self.learner.set_model(model, None if fitted is None else fitted.actors)
         self.learner.set_starts(task.starts.result(), task.new_share)
-        self.learner.partner_scores, self.learner.plays = dict(task.partner_scores), task.plays
+        self.learner.partner_scores = dict(task.partner_scores)
+        self.learner.self_play_has_begun = task.self_play_has_begun
         self.learner.constraint.multipliers = dict(task.multipliers)
         rates: dict[str, float] = {} if fitted is None else dict(fitted.figures)
         if task.tally is not None:
             recent = None if task.recent is None else task.recent.result()
             rates |= self.learner.compare_with_real_play(task.tally, recent)
-        totals: dict[str, list[float]] = defaultdict(list)
         for _ in range(task.updates):
-            for name, value in self.learner.update().items():
-                totals[name].append(value)
-        means = {name: float(np.mean(values)) for name, values in totals.items()} | rates
-        means["seconds"] = time.perf_counter() - began
-        means["cpu_seconds"] = time.process_time() - began_cpu
-        means["update_ms"] = 1000.0 * means["seconds"] / task.updates
+            figures.add(self.learner.update())
+        means = figures.means() | rates | figures.times(task.updates)
         acting, critics = self.acting_weights(model), weights_of(self.learner.critics)
         return AgentUpdate(MemberWeights(self.transport.put(acting), self.transport.put(critics), task.model), means)
 
@@ -233,7 +223,7 @@ class AgentActor:
         return prefixed("filter", under("filter", model)) | prefixed("actor", self.learner.actor_weights())
 
     def state(self) -> dict[str, Any]:
-        """Of the learner: everything but the world model and the start states, which come with every task."""
+        """Collect the learner's state: all but world model and start states, which come with every task."""
         return self.learner.state()
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -284,20 +274,20 @@ class XpmWmWorkers:
         self.agent: Worker[AgentActor] = start(AgentActor, place, config, cluster.threads, transport)
 
     def put(self, value: Any) -> Pending[Any]:
-        """Into the transport's store."""
+        """Put a value into the transport's store."""
         return self.transport.put(value)
 
     def wait(self, pending: Sequence[Pending[Any]], timeout: float | None = None) -> list[Pending[Any]]:
-        """See `Transport.wait`."""
+        """Wait for handles; see `Transport.wait`."""
         return self.transport.wait(pending, timeout)
 
     def begin_member(self, member: int, seed: int, archive: dict[int, Weights]) -> None:
-        """Both learners'."""
+        """Have both learners begin with a member (line 1) and wait until they have."""
         self.agent.ask(AgentActor.begin_member, member, seed, archive).result()
         self.model.ask(WorldModelActor.begin_member, member, archive).result()
 
     def restart_agent(self, seed: int) -> None:
-        """The agent learner's."""
+        """Have the agent's learner begin anew and wait until it has."""
         self.agent.ask(AgentActor.restart, seed).result()
 
     # ---- real episodes ---------------------------------------------------------------------------------------------
@@ -305,23 +295,23 @@ class XpmWmWorkers:
     def start_episodes(
         self, matches: list[Match], policies: dict[int, PolicySnapshot], seed: int, stagger: bool = False
     ) -> None:
-        """All samplers'."""
+        """Start fresh episodes on all samplers."""
         self.pool.open(matches, policies, seed, stagger)
 
     def collect(self, steps: int) -> list[Sampled]:
-        """All samplers at the same time."""
+        """Let all samplers play at the same time."""
         return self.pool.collect(steps)
 
     def samplers(self) -> list[str]:
-        """sampler0, sampler1, ... of those with matches."""
+        """Name those with matches: sampler0, sampler1, ..."""
         return [f"sampler{index}" for index in self.pool.active]
 
     def start_sampling(self, sampler: str, steps: int, member: int, acting: Pending[Weights]) -> Pending[Sampled]:
-        """One sampler's."""
+        """Let one sampler play on, with new weights of one member."""
         return self.pool.start(int(sampler.removeprefix("sampler")), steps, member, acting)
 
     def add_to_buffers(self, sampled: Sequence[Sampled], owner: int) -> None:
-        """Each segment goes to the one buffer that wants it; it has arrived when this returns."""
+        """Send each segment to the one buffer that wants it; it has arrived when this returns."""
         wait_for_all(added for one in sampled for added in self._send(one.segments, owner))
 
     def _send(self, segments: Segments, owner: int) -> list[Pending[int]]:
@@ -333,37 +323,37 @@ class XpmWmWorkers:
     # ---- learning --------------------------------------------------------------------------------------------------
 
     def update_world_model(self, task: ModelTask) -> Pending[ModelUpdate]:
-        """The world-model learner's."""
+        """Ask the world-model learner for updates."""
         return self.model.ask(WorldModelActor.train, task)
 
     def tally(self, member: int) -> Pending[Tally]:
-        """B_SP's."""
+        """Ask B_SP what it has taken in."""
         return self.replays["replay_sp"].ask(ReplayActor.tally, member)
 
     def cache_starts(self) -> Pending[Starts]:
-        """The world-model learner's."""
+        """Ask the world-model learner for start states."""
         return self.model.ask(WorldModelActor.cache_starts)
 
     def fit_partners(self) -> Pending[FittedPartners]:
-        """The world-model learner's."""
+        """Ask the world-model learner for partners' actors on its latents."""
         return self.model.ask(WorldModelActor.fit_partners)
 
     def model_weights(self) -> Pending[Weights]:
-        """The world-model learner's."""
+        """Ask the world-model learner for its weights."""
         return DelayedWeights(self.model.ask(WorldModelActor.weights))
 
     def report_model(self) -> Pending[dict[str, float]]:
-        """The world-model learner's."""
+        """Ask the world-model learner for a report on fresh windows."""
         return self.model.ask(WorldModelActor.report)
 
     def update_agent(self, task: AgentTask) -> Pending[AgentUpdate]:
-        """The agent learner's."""
+        """Ask the agent's learner for updates in imagination."""
         return self.agent.ask(AgentActor.train, task)
 
     # ---- checkpoints -----------------------------------------------------------------------------------------------
 
     def state(self) -> State:
-        """Handles; the buffers themselves are in the log."""
+        """Ask all workers for their state; handles, without the buffers' rows, which are in the log."""
         return {
             "model": self.model_state(),
             "agent": self.agent.ask(AgentActor.state),
@@ -372,15 +362,15 @@ class XpmWmWorkers:
         }
 
     def buffers_state(self) -> State:
-        """Handles of both buffers."""
+        """Ask both buffers for whole copies; handles."""
         return {name: replay.ask(ReplayActor.state) for name, replay in self.replays.items()}
 
     def model_state(self) -> Pending[State]:
-        """The world-model learner's."""
+        """Ask the world-model learner for its state."""
         return self.model.ask(WorldModelActor.state)
 
     def adopt(self, left: State) -> None:
-        """Buffers and world model as a finished member left them."""
+        """Load buffers and world model as a finished member left them."""
         if left:
             self._load_buffers(left)
             self.model.ask(WorldModelActor.load_state, left["model"]).result()
@@ -389,7 +379,7 @@ class XpmWmWorkers:
         wait_for_all(replay.ask(ReplayActor.load_state, states[name]) for name, replay in self.replays.items())
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Buffers from their last whole copy and the log, then both learners."""
+        """Load buffers from their last whole copy and the log, then both learners."""
         if checkpoint.buffers is not None:
             self._load_buffers(checkpoint.buffers)
         for segments, owner in checkpoint.log:
@@ -400,11 +390,11 @@ class XpmWmWorkers:
         self.agent.ask(AgentActor.load_state, state["agent"]).result()
 
     def restore_samplers(self, states: list[State]) -> None:
-        """All samplers'."""
+        """Load the running episodes into the samplers."""
         self.pool.load_state(states)
 
     def published_form(self) -> State:
-        """Of the restored learners."""
+        """Ask the restored learners for the weights that they had published."""
         model, agent = self.model_weights().result(), self.agent.ask(AgentActor.state).result()
         acting = self.agent.ask(AgentActor.acting_weights, model).result()
         return {"acting": acting, "model": model, "critics": agent["critics"]}

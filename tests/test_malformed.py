@@ -22,10 +22,10 @@ import pytest
 from popgen import cli
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
+from popgen.durable_files import ARRAYS, VALUES, load_state, save_state
 from popgen.pipelines import population as main_job
 from popgen.progress import NullReporter
 from popgen.runs.checkpoints import Checkpoints
-from popgen.runs.state_files import ARRAYS, VALUES, load_state, save_state
 
 RUN = (
     *("scale=smoke", "tracking=off", "population.size=2", "env.params.horizon=20", "seed=3", "run.root=runs"),

@@ -100,7 +100,7 @@ def bench_mappo(args: argparse.Namespace) -> int:
     """Environment steps a second of MAPPO's training."""
     from popgen.methods.mappo.config import MappoRun
 
-    config = _check_run(MappoRun, [*args.overrides, "method=mappo"])
+    config = _check_run(MappoRun, args.overrides)
     from popgen.pipelines.bench_mappo import bench_mappo as measure
 
     result = measure(config, seconds=args.seconds)
@@ -119,10 +119,10 @@ def bench_ego(args: argparse.Namespace) -> int:
     from popgen.config.run_config import RunConfig
     from popgen.methods.ego.config import EgoRun, FcpRun
 
-    words = [f"method={FcpRun.model_fields['method'].default}", "cluster.threads=2", *args.overrides]
+    words = [FcpRun.method_override(), "cluster.threads=2", *args.overrides]
     config = RunConfig.parse(compose(words))
     if not isinstance(config, EgoRun) or config.plays_itself:
-        raise UserError("method", f"{config.method} has no partners", "choose ego_fcp or hipt")
+        raise UserError("method", f"{config.method} has no partners", "choose an ego that learns beside a population")
     from popgen.pipelines.bench_ego import bench_ego as measure
 
     result = measure(config, seconds=args.seconds, partners=args.partners)
@@ -141,8 +141,7 @@ def bench_world_model(args: argparse.Namespace) -> int:
     """Milliseconds of an update."""
     from popgen.methods.xpm_wm.config import XpmWmRun
 
-    words = [*args.overrides, "method=xpm_wm"]
-    configs = {name: _check_run(XpmWmRun, [*words, f"scale={name}"]) for name in args.scales.split(",")}
+    configs = {name: _check_run(XpmWmRun, [*args.overrides, f"scale={name}"]) for name in args.scales.split(",")}
     from popgen.pipelines.bench_world_model import bench_world_model as measure
 
     result = measure(configs, seconds=args.seconds)
@@ -157,7 +156,7 @@ def bench_scale(args: argparse.Namespace) -> int:
     """Environment steps a second with several samplers."""
     from popgen.methods.xpm_wm.config import XpmWmRun
 
-    config = _check_run(XpmWmRun, [*args.overrides, "method=xpm_wm"])
+    config = _check_run(XpmWmRun, args.overrides)
     from popgen.pipelines.bench_scale import bench_scale as measure
 
     tell = (lambda text: None) if args.quiet else (lambda text: print(text, file=sys.stderr))
@@ -186,10 +185,10 @@ def _print_learners(result: Mapping[str, Any]) -> None:
 
 
 def _check_run(schema: type[C], overrides: list[str]) -> C:
-    """A run of the method that `overrides` name and whose schema is given."""
+    """A run of the method whose schema is given."""
     from popgen.runs.preflight import preflight
 
-    config = schema.parse(compose(overrides))
+    config = schema.parse(compose([*overrides, schema.method_override()]))
     assert isinstance(config, schema)
     preflight(config)
     before_ray(config.cluster.threads, config.cluster.address is None)

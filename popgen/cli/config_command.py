@@ -59,6 +59,7 @@ def add(commands: Any) -> None:
         "method, scale, env, fields (name, value, default, range, meaning, source, reason, ours).",
     )
     parser.add_argument("overrides", nargs="*", metavar="[METHOD] [KEY=VALUE]", help="of which run")
+    parser.add_argument("--changed", action="store_true", help="only values that are not the schema's defaults")
     parser.add_argument("--section", default=None, metavar="NAME", help="only this one, such as agent or phase1")
     add_config_dir(parser)
 
@@ -73,6 +74,8 @@ def show_config(args: argparse.Namespace) -> int:
     composed = compose_sources(words, args.config_dir)
     config = RunConfig.parse(composed.values)
     rows = choose_section(list_rows(composed, config.as_dict()), args.section)
+    if args.changed:
+        rows = [row for row in rows if row.value != row.default]
     head = {"method": config.method, "scale": config.scale, "env": config.env.name}
     if args.json:
         print_json({**head, "fields": [asdict(row) for row in rows]})

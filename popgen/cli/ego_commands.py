@@ -40,12 +40,13 @@ def train_ego(args: argparse.Namespace) -> int:
     """Train an ego, or say what would be done."""
     bound_threads(1)
     from popgen.config.run_config import RunConfig
+    from popgen.methods.registry import DEFAULT_EGO
     from popgen.pipelines.ego_training import environment_of, find_ego_method, pin_partners
 
     partners = [word for word in args.overrides if "=" not in word]
     overrides = [word for word in args.overrides if "=" in word]
     keys = [word.lstrip("+").partition("=")[0] for word in overrides]
-    method = dict(word.partition("=")[::2] for word in overrides).get("method", "hipt")
+    method = dict(word.partition("=")[::2] for word in overrides).get("method", DEFAULT_EGO)
     overrides = [*(word for word in overrides if not word.startswith("method=")), f"method={find_ego_method(method)}"]
     info = environment_of(partners) if partners else None
     if info is not None and not any(key == "env" or key.startswith("env.") for key in keys):

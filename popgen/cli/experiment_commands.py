@@ -119,7 +119,9 @@ def shared_encoder(args: argparse.Namespace) -> int:
     """Train both kinds, unless runs are given, and draw their learning curves."""
     if args.overrides and args.run:
         raise UserError("overrides", "have no use where nothing is trained", "leave out --run")
-    base = [*_rendezvous(args.overrides), "method=xpm_sim", "population.size=8", *args.overrides]
+    from popgen.methods.xpm_sim.config import XpmSimRun
+
+    base = [*_rendezvous(args.overrides), XpmSimRun.method_override(), "population.size=8", *args.overrides]
     kinds = [] if args.run else ["none", "shared"]
     overrides = [[*base, f"xpm_sim.encoder={kind}", f"seed={seed}"] for seed in args.seeds for kind in kinds]
     configs = runs_to_start(overrides, args.out, args.overrides, args.config_dir, quiet=args.quiet)

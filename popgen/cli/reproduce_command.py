@@ -177,11 +177,10 @@ def _read_ego_settings(budget: Budget, overrides: Sequence[str], config_dir: str
         UserError: a value that does not fit.
     """
     from popgen.config.run_config import RunConfig, field_names
-    from popgen.methods.registry import METHODS
+    from popgen.methods.registry import DEFAULT_EGO, METHODS
     from popgen.pipelines.ego_training import find_ego_method
-    from popgen.reports.reproduction.run_lists import EGO
 
-    method = find_ego_method(EGO)
+    method = find_ego_method(DEFAULT_EGO)
     populations = (set(field_names(one.config)) for one in METHODS.values() if not one.trains_ego)
     own = set(field_names(METHODS[method].config)).difference(*populations)
     words = [word for word in overrides if word.partition("=")[0] in own]
@@ -257,7 +256,7 @@ def _print_screen(work: Pieces, *, to_stderr: bool) -> None:
 def _publish_records(records: dict[str, Any], folder: Path) -> None:
     """Records with runs, as files of less than MOST_BYTES."""
     from popgen.durable_files import replace_file
-    from popgen.reports.reproduction.results_page import MOST_BYTES, to_record_text
+    from popgen.reports.reproduction.results_page import MOST_BYTES, name_record, to_record_text
 
     folder.mkdir(parents=True, exist_ok=True)
     for name, record in records.items():
@@ -265,7 +264,7 @@ def _publish_records(records: dict[str, Any], folder: Path) -> None:
         if len(data) > MOST_BYTES:
             raise UserError("--publish", f"the record of {name} has {len(data):,} bytes", "publish fewer seeds")
         if record["runs"]:
-            replace_file(folder / f"{name}-{record['budget']}.json", data)
+            replace_file(folder / f"{name_record(record)}.json", data)
 
 
 def _write_page(path: Path) -> int:

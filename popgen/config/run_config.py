@@ -63,6 +63,11 @@ class RunConfig(Schema):
         except ValidationError as error:
             raise as_user_error(error, schema=schema) from None
 
+    @classmethod
+    def method_override(cls) -> str:
+        """The override that chooses the method of this schema."""
+        return f"method={cls.model_fields['method'].default}"
+
     def as_dict(self) -> dict[str, Any]:
         """JSON-able, without credentials that addresses hold."""
         return _mask_values(self.model_dump(mode="json"))

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from popgen.durable_files import name_folder
 from popgen.errors import UserError
 from popgen.humans.behaviour import (
     MEASURES,
@@ -211,7 +212,7 @@ def fit_missing_population(
         unfinished = path.with_name(f".{path.name}")
         shutil.rmtree(unfinished, ignore_errors=True)
         fit_population(unfinished, layout, half, seed=seed, search=search)
-        unfinished.rename(path)
+        name_folder(unfinished, path)
     return path
 
 

@@ -11,7 +11,7 @@ A sign is applied to the advantage before any surrogate or clipping; value losse
 
 Two further options of every such objective, ours:
 
-    a bound       cross-play's advantages count for at most `clip` spreads of self-play's
+    a bound       cross-play's advantages count for at most `clip` units of self-play's
     a constraint  maximise J_SP(j) subject to J_XP(j, k) <= limit for every k, by multipliers m_k in [0, 1]: not the
                   strongest partner's J_XP falls, but one that is drawn in proportion to m_k, with lambda_XP max_k m_k
 """
@@ -72,25 +72,25 @@ SIGN: dict[Kind, float] = {Kind.SP: +1.0, Kind.MP: +1.0, Kind.XP: -1.0}
 
 
 def signed_advantage(
-    kind: Kind, advantage: Float[Tensor, "*rows"], *, weight: float, scale: Float[Tensor, ""] | float
+    kind: Kind, advantage: Float[Tensor, "*rows"], *, weight: float, unit: Float[Tensor, ""] | float
 ) -> Float[Tensor, "*rows"]:
-    """Advantage as it enters the policy gradient: sign x weight x advantage / scale.
+    """Advantage as it enters the policy gradient: sign x weight x advantage / unit.
 
-    `scale` comes from *self-play* for every kind (the on-policy baselines take the kind's own spread where that is
+    `unit` comes from *self-play* for every kind (the on-policy baselines take the kind's own spread where that is
     larger): cross-play's own, smaller spread would multiply lambda several-fold. Cross-play advantages are centred,
     since pushing all returns down would otherwise reward leaving the states in which they were collected.
     """
     if kind is Kind.XP:
         advantage = advantage - advantage.mean()
-    return SIGN[kind] * weight * advantage / scale
+    return SIGN[kind] * weight * advantage / unit
 
 
 def bound_advantage(
-    advantage: Float[Tensor, "*rows"], *, clip: float, spread: Float[Tensor, ""] | float
+    advantage: Float[Tensor, "*rows"], *, clip: float, unit: Float[Tensor, ""] | float
 ) -> Float[Tensor, "*rows"]:
-    """Cross-play's advantages, at most `clip` spreads of self-play's in size (0: as they are): so a large loss for the
-    team, such as the penalty of leaving, is no larger gain than holding to another convention."""
-    bound = spread * (clip or math.inf)
+    """Cross-play's advantages, clipped to +-`clip` times `unit`, which comes from self-play (0: as they are): so a
+    large loss for the team, such as the penalty of leaving, is no larger gain than holding to another convention."""
+    bound = unit * (clip or math.inf)
     return advantage.clamp(-float(bound), float(bound))
 
 
@@ -204,7 +204,7 @@ class ReturnScale(nn.Module):
 # ---- schedules -------------------------------------------------------------------------------------------------------
 
 
-def linear(start: float, end: float, done: int | float, length: int | float) -> float:
+def linear_schedule(start: float, end: float, done: int | float, length: int | float) -> float:
     """From `start` to `end`, even over `length` steps of which `done` are over; `end` at once where `length` is 0."""
     return start + (end - start) * min(1.0, done / length) if length else end
 

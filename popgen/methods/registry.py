@@ -50,6 +50,9 @@ BUILT_IN: dict[str, str] = {
 DEFAULT = "xpm_wm"
 """The method of a configuration that names none."""
 
+DEFAULT_EGO = "hipt"
+"""The method of an ego agent that names none."""
+
 DEFAULT_RECIPE = "laptop"
 
 

@@ -2,7 +2,7 @@
 
 A training loop is a generator of records: what it does next (`Phase`), what happened (`Progress`, `Round`), what came
 of it (`TrainedMember`). It writes no file, counts no step in a ledger and prints nothing. One driver for all methods
-(`popgen.pipelines.population`) iterates over it, hands each record to the recorder and the reporter, and makes a
+(`popgen.pipelines.training_driver`) iterates over it, hands each record to the recorder and the reporter, and makes a
 checkpoint at a `Round` with `at_rest`. The driver answers a `Round` with True where it wants a checkpoint and the round
 was not at rest: the loop then comes to rest soon and yields a `Round` that is.
 
@@ -20,9 +20,13 @@ and parts of answers: whoever needs the value calls `result`.
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Concatenate, Generic, NamedTuple, ParamSpec, Protocol, TypeVar
+
+import numpy as np
 
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
@@ -31,10 +35,44 @@ from popgen.play.policy import Policy
 from popgen.types import Kind, Segment, Weights
 
 State = dict[str, Any]
-"""Nested dictionaries of arrays and plain values, as `popgen.runs.state_files` writes them. In a checkpoint a `Pending`
+"""Nested dictionaries of arrays and plain values, as `popgen.durable_files` writes them. In a checkpoint a `Pending`
 may stand in for a value: the process that writes the files resolves it, so that bulk data does not pass the driver."""
 
 Figures = Mapping[str, float]
+
+
+class UpdateFigures:
+    """Figures of one task's updates, and the time since it began, in this process.
+
+    Attributes:
+        values: of each figure, an entry for each update that gave it.
+    """
+
+    def __init__(self) -> None:
+        self.values: dict[str, list[float]] = defaultdict(list)
+        self._began, self._began_cpu = time.perf_counter(), time.process_time()
+
+    def add(self, figures: Mapping[str, float]) -> None:
+        """Take in the figures of one update."""
+        for name, value in figures.items():
+            self.values[name].append(value)
+
+    def means(self) -> dict[str, float]:
+        """Mean of each figure over the updates."""
+        return {name: float(np.mean(values)) for name, values in self.values.items()}
+
+    def seconds(self) -> float:
+        """Seconds since the task began."""
+        return time.perf_counter() - self._began
+
+    def cpu_seconds(self) -> float:
+        """Processor seconds since the task began."""
+        return time.process_time() - self._began_cpu
+
+    def times(self, updates: int) -> dict[str, float]:
+        """Seconds and processor seconds of the task so far, and milliseconds of each of its `updates`."""
+        seconds = self.seconds()
+        return {"seconds": seconds, "cpu_seconds": self.cpu_seconds(), "update_ms": 1000.0 * seconds / max(1, updates)}
 
 
 def named_figures(learner: str, metrics: Figures) -> dict[str, float]:
@@ -210,6 +248,10 @@ class Work:
     tasks: int = 0
     seconds: float = 0.0
     cpu_seconds: float = 0.0
+
+    def plus(self, more: Work) -> Work:
+        """This work and more of the same kind."""
+        return Work(self.tasks + more.tasks, self.seconds + more.seconds, self.cpu_seconds + more.cpu_seconds)
 
 
 @dataclass(frozen=True)

@@ -74,12 +74,10 @@ def publish_folder(final: Path, contents: Mapping[str, bytes]) -> None:
         temporary.chmod(0o777 & ~_umask())
         for name, data in contents.items():
             durable_files.write_file(temporary / name, data)
-        durable_files.sync_folder(temporary)
-        os.rename(temporary, final)
+        durable_files.name_folder(temporary, final)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    durable_files.sync_folder(final.parent)
 
 
 def _umask() -> int:

@@ -32,10 +32,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from popgen.durable_files import write_file
+from popgen.durable_files import load_state, save_state, write_file
 from popgen.errors import UserError
 from popgen.methods.training import Checkpoint, InlineTransport, Place, Segments, State, Transport, Worker
-from popgen.runs.state_files import load_state, save_state
 from popgen.types import Kind, Segment
 
 _ARRAYS = tuple(field.name for field in fields(Segment) if field.name not in ("kind", "members", "sampler", "sequence"))

@@ -20,7 +20,7 @@ from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from popgen.durable_files import read_regular, replace_file, write_file
+from popgen.durable_files import name_folder, read_regular, replace_file, write_file
 from popgen.errors import UserError
 
 LATEST, OBJECTS, MARK = "latest.json", "objects", "storage.json"
@@ -171,7 +171,7 @@ class Mirror:
             )
             self.folder.rename(aside)
             told += f", which is newer; the folder as it was is {aside}"
-        fresh.rename(self.folder)
+        name_folder(fresh, self.folder)
         return told
 
     def _read_mark(self) -> str | None:

@@ -84,6 +84,14 @@ def test_a_section_alone(run: Run) -> None:
     assert code == 2 and out == "" and "choose one of general, env" in err and err.count("\n") == 1
 
 
+def test_only_what_is_changed(run: Run) -> None:
+    words = ("xpm_wm", "env=overcooked/forced_coordination", "agent.units=64")
+    shown, changed = fields(run, *words), fields(run, *words, "--changed")
+    assert changed == {name: row for name, row in shown.items() if row["value"] != row["default"]}
+    assert {"phase1.prefill_steps", "agent.units"} <= set(changed) and len(changed) < len(shown) / 5
+    assert all(row["reason"] for row in changed.values() if row["source"] == "recipe laptop")
+
+
 def test_mistakes_are_those_of_run(run: Run) -> None:
     for words in (["lipo2"], ["agent.lamda_xp=1"], ["agent.lambda_xp=-1"], ["a", "b"]):
         code, out, err = run("config", *words)

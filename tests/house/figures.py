@@ -17,6 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 TOP = ("popgen", "actors", "pipelines", "conf")  # popgen/actors, popgen/pipelines, popgen/conf are links: read once
 SAME_ROLE = ("__init__.py", "__main__.py")
+SELF_PLAY_SCORE = "sp"  # also a method's name; reports have a column of it
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -92,9 +93,20 @@ def find_long_classes(root: Path, longest: int = 200) -> list[str]:
     ]
 
 
+def list_methods(root: Path) -> set[str]:
+    """The keys of the registry's table."""
+    tables = [
+        node.value
+        for node in parse_file(root / "popgen" / "methods" / "registry.py").body
+        if isinstance(node, ast.AnnAssign) and getattr(node.target, "id", "") == "BUILT_IN"
+    ]
+    return {str(name) for table in tables for name in ast.literal_eval(table)}
+
+
 def find_method_literals(root: Path) -> list[str]:
-    """String constants that name a method, outside popgen/methods and conf/."""
-    methods = {path.stem for path in (root / "conf" / "method").glob("*.yaml")}
+    """String constants that name a method, alone or as `method=NAME`, outside popgen/methods and conf/."""
+    names = list_methods(root) - {SELF_PLAY_SCORE}
+    methods = names | {f"method={name}" for name in names | {SELF_PLAY_SCORE}}
     return [
         f"{name}:{node.lineno} {node.value!r}"
         for name, tree in parse_sources(root)

@@ -1,10 +1,10 @@
-"""Golden figures of a checkout: what short runs of all methods learn, count and score, as digests in a JSON file.
+"""Golden figures of a checkout: what short runs learn, count and score, as digests in a JSON file.
 
     python tests/house/golden.py record before.json --checkout ../older
     python tests/house/golden.py record after.json
     python tests/house/golden.py compare before.json after.json
 
-Every method trains three members at scale=smoke with run.schedule=sync; the first one also in a run that is killed
+Each of METHODS trains three members at scale=smoke with run.schedule=sync; the first one also in a run that is killed
 with SIGKILL halfway and resumed. Equal figures mean that two versions of the code learn the same numbers. The digests
 are those of one kind of processor and one torch: record both files on the same machine.
 """

@@ -66,10 +66,10 @@ def test_return_scale_is_never_below_one() -> None:
 def test_signs() -> None:
     assert SIGN == {Kind.SP: 1.0, Kind.MP: 1.0, Kind.XP: -1.0}
     advantage = torch.tensor([3.0, 1.0, -1.0])
-    torch.testing.assert_close(signed_advantage(Kind.SP, advantage, weight=1.0, scale=2.0), advantage / 2)
-    torch.testing.assert_close(signed_advantage(Kind.MP, advantage, weight=0.5, scale=1.0), advantage / 2)
+    torch.testing.assert_close(signed_advantage(Kind.SP, advantage, weight=1.0, unit=2.0), advantage / 2)
+    torch.testing.assert_close(signed_advantage(Kind.MP, advantage, weight=0.5, unit=1.0), advantage / 2)
     # Centred (mean 1), then negated: the action that cross-play gained most from is pushed down most.
-    crossed = signed_advantage(Kind.XP, advantage, weight=0.25, scale=torch.tensor(2.0))
+    crossed = signed_advantage(Kind.XP, advantage, weight=0.25, unit=torch.tensor(2.0))
     torch.testing.assert_close(crossed, torch.tensor([-0.25, 0.0, 0.25]))
-    moved = signed_advantage(Kind.XP, advantage + 100, weight=0.25, scale=2.0)
+    moved = signed_advantage(Kind.XP, advantage + 100, weight=0.25, unit=2.0)
     torch.testing.assert_close(moved, crossed)

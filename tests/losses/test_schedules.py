@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from popgen.losses.policy_losses import annealed, geometric, linear
+from popgen.losses.policy_losses import annealed, geometric, linear_schedule
 
 
 def test_linear_rises_and_stays() -> None:
-    assert [linear(1.0, 3.0, done, 4) for done in (0, 1, 2, 4, 9)] == [1.0, 1.5, 2.0, 3.0, 3.0]
-    assert linear(1.0, 3.0, 0, 0) == 3.0  # no ramp
+    assert [linear_schedule(1.0, 3.0, done, 4) for done in (0, 1, 2, 4, 9)] == [1.0, 1.5, 2.0, 3.0, 3.0]
+    assert linear_schedule(1.0, 3.0, 0, 0) == 3.0  # no ramp
 
 
 def test_geometric_falls_by_the_same_factor() -> None:

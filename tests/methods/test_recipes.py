@@ -30,8 +30,8 @@ def test_a_row_goes_over_its_recipe_and_a_recipe_over_the_row_of_its_base() -> N
     assert BASE.values("ring") == {"a": {"x": 3, "y": 2}}
     assert SHORT.values("room") == {"a": {"x": 1, "y": 4}}
     assert SHORT.values("ring") == {"a": {"x": 3, "y": 4, "z": 5}}
-    told = SHORT.list_settings("ring")["a.x"]
-    assert (told.source, told.setting.reason) == ("layout row of base", "narrow")
+    listed = SHORT.list_settings("ring")["a.x"]
+    assert (listed.source, listed.setting.reason) == ("layout row of base", "narrow")
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -22,6 +22,7 @@ from popgen.actors.ray_transport import RayTransport
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
 from popgen.config.sections import ClusterConfig
+from popgen.durable_files import load_state, save_state
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.methods.mappo import comedi, lipo
@@ -38,7 +39,6 @@ from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.preflight import preflight
 from popgen.runs.recorder import RunRecorder
-from popgen.runs.state_files import load_state, save_state
 from popgen.types import Kind
 
 HORIZON = 40

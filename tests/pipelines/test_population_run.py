@@ -19,6 +19,7 @@ import ray
 from popgen.actors.xpm_wm_workers import open_training
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig
+from popgen.durable_files import load_state
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.methods.training import Collected, InlineTransport, Ready, Round, TrainedMember
@@ -36,7 +37,6 @@ from popgen.progress import NullReporter
 from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.recorder import RunRecorder
-from popgen.runs.state_files import load_state
 from popgen.types import Kind
 
 pytestmark = pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")  # as in the actors
@@ -439,7 +439,7 @@ def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
     none = np.zeros(0, np.int64)
     tally = Tally(np.array([9, 8, 9, 9, 0]), np.zeros(5, np.int64), 0, none, none, ())
     work: Any = SimpleNamespace(update_world_model=asked.append)
-    progress = FirstMemberProgress(16, plays=plays)
+    progress = FirstMemberProgress(16, self_play_has_begun=plays)
     spec = make_env(config.env.name, 1).spec
     FirstMember(Setup(work, config, spec, 1, 0, {}, lambda: tally), progress).update_world_model(7)
     rows = config.phase1.envs * config.phase1.steps_per_iteration

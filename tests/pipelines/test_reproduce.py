@@ -159,7 +159,7 @@ def test_finished_runs_of_elsewhere_are_taken_if_they_are_the_same(
     assert run("reproduce", "wall-clock", *SMALL)[0] == 0
     there = ("reproduce", "wall-clock", "population.size=2", "--budget", "smoke", "--out", "b", "--runs", "out/runs")
     assert run(*there, "--quiet", "--publish", "kept")[0] == 0 and len(training.calls) == 4
-    kept = json.loads((tmp_path / "kept" / "wall-clock-smoke.json").read_text())
+    kept = json.loads((tmp_path / "kept" / "wall-clock-smoke-population.size=2.json").read_text())
     assert all(one["taken_over"] for one in kept["runs"]) and len(kept["runs"]) == 4
     assert run(*there[:-4], "--out", "c", *there[-2:], "--quiet", "--seeds", "2")[0] == 0
     assert len(training.calls) == 8  # of another seed
@@ -232,7 +232,7 @@ def test_what_an_earlier_record_tells_is_not_made_again(run: Run, training: Trai
     four, the three as they were."""
     training.refused = {"comedi"}
     assert run("reproduce", "wall-clock", *SMALL, "--publish", "kept")[0] == 2
-    before = json.loads((tmp_path / "kept" / "wall-clock-smoke.json").read_text())
+    before = json.loads((tmp_path / "kept" / "wall-clock-smoke-population.size=2.json").read_text())
     assert [one["row"] for one in before["runs"]] == ["XPM-WM", "XPM-Sim", "LIPO"]
     shutil.rmtree(tmp_path / "out")
     training.refused = set()

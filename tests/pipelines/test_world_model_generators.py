@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from popgen.config.run_config import RunConfig
+from popgen.durable_files import load_state
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.methods.registry import METHODS, find_method, recipe
@@ -23,7 +24,6 @@ from popgen.progress import NullReporter
 from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
 from popgen.runs.recorder import RunRecorder
-from popgen.runs.state_files import load_state
 from popgen.types import Kind
 
 HORIZON, ROUNDS = 20, 3

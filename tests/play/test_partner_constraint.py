@@ -45,9 +45,9 @@ def test_without_a_limit_there_is_no_constraint() -> None:
 
 def test_bounds_are_in_units_of_self_plays_spread() -> None:
     given = torch.tensor([-172.0, -0.1, 0.3, 5.0])
-    bounded = bound_advantage(given, clip=1.5, spread=0.4)
+    bounded = bound_advantage(given, clip=1.5, unit=0.4)
     torch.testing.assert_close(bounded, torch.tensor([-0.6, -0.1, 0.3, 0.6]))
-    assert bound_advantage(given, clip=0.0, spread=torch.tensor(0.4)).tolist() == given.tolist()
+    assert bound_advantage(given, clip=0.0, unit=torch.tensor(0.4)).tolist() == given.tolist()
 
 
 def test_partners_are_drawn_in_proportion_and_get_the_largest_multiplier() -> None:

@@ -65,7 +65,7 @@ def test_the_seed_decides() -> None:
 
 @pytest.mark.parametrize("max_envs", [1, 2, 5, 100])
 def test_teams_in_batches_of_any_size(max_envs: int) -> None:
-    made, told = [], []
+    made, reported = [], []
 
     def make(num_envs: int, seed: int) -> TallyEnv:
         made.append(num_envs)
@@ -73,14 +73,14 @@ def test_teams_in_batches_of_any_size(max_envs: int) -> None:
 
     matches = [(0, 1), (1, 1), (1, 0)]
     policies = [Script([ONE]), Script([TWO])]
-    played = play_teams(make, policies, matches, 3, seed=0, max_envs=max_envs, progress=lambda *at: told.append(at))
+    played = play_teams(make, policies, matches, 3, seed=0, max_envs=max_envs, progress=lambda *at: reported.append(at))
     np.testing.assert_array_equal(played.seats, np.repeat(matches, 3, axis=0))
     np.testing.assert_array_equal(played.score, np.repeat([6 * 21, 6 * 22, 6 * 12], 3))
     assert sum(made) == 9 and max(made) <= max_envs and played.steps == 9 * HORIZON
-    assert told == sorted(told) and {total for _, total in told} == {9}
-    assert {min(end, 9) for end in range(max_envs, 9 + max_envs, max_envs)} <= {done for done, _ in told}
+    assert reported == sorted(reported) and {total for _, total in reported} == {9}
+    assert {min(end, 9) for end in range(max_envs, 9 + max_envs, max_envs)} <= {done for done, _ in reported}
     if max_envs > 9:  # each step of nine environments is one and a half episodes of six
-        assert [done for done, _ in told] == [1, 3, 4, 6, 7, 9, 9]
+        assert [done for done, _ in reported] == [1, 3, 4, 6, 7, 9, 9]
 
 
 def test_bad_arguments() -> None:

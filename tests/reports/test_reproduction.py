@@ -15,6 +15,7 @@ from popgen.methods.registry import METHODS, list_objectives
 from popgen.reports.charts import reproduction_charts
 from popgen.reports.reproduction.results_page import (
     MOST_BYTES,
+    name_record,
     read_record,
     read_records,
     to_page,
@@ -164,6 +165,17 @@ def test_a_page_of_records_is_the_same_twice(tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text(json.dumps({"format": "popgen-crossplay"}))
     with pytest.raises(UserError, match="no record of popgen reproduce"):
         read_records(tmp_path)
+
+
+def test_records_of_one_target_stand_beside_each_other(tmp_path: Path) -> None:
+    eight, three = (
+        record("sp-xp", [sabotage(3, 0.1, -1.0)]) | {"settings": [f"population.size={size}"]} for size in (8, 3)
+    )
+    for one in (eight, three):
+        (tmp_path / f"{name_record(one)}.json").write_text(to_record_text(one))
+    assert name_record(eight) == "sp-xp-laptop-population.size=8"
+    headings = [line for line in to_page(read_records(tmp_path)).splitlines() if line.startswith("## ")]
+    assert [line.rpartition(", ")[2] for line in headings] == ["population.size=3", "population.size=8"]
 
 
 @pytest.mark.skipif(not PUBLISHED.is_dir(), reason="nothing is published")

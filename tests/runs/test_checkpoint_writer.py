@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from support.small import kitchen, random_play
 
+from popgen.durable_files import load_state
 from popgen.methods.training import Ready, Segments
 from popgen.methods.xpm_wm.world_model import Starts
 from popgen.runs.checkpoints import CheckpointFiles, resolve_handles
-from popgen.runs.state_files import load_state
 from popgen.types import Kind
 
 

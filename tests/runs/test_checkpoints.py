@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support.small import kitchen, random_play
 
+from popgen.durable_files import save_state
 from popgen.errors import UserError
 from popgen.runs.checkpoints import Checkpoints, member_folder
-from popgen.runs.state_files import save_state
 
 
 def whole_buffers() -> dict[str, Any]:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from popgen import durable_files as checkpoint
+from popgen.durable_files import ARRAYS, VALUES, load_state, save_state
 from popgen.errors import UserError
-from popgen.runs import state_files as checkpoint
-from popgen.runs.state_files import ARRAYS, VALUES, load_state, save_state
 
 
 def state(seed: int = 0) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def test_an_interrupted_save_leaves_the_old_state(tmp_path: Path, monkeypatch: p
         elif fault == "fsync":
             patch.setattr(os, "fsync", fail)
         else:
-            patch.setattr(Path, "rename", fail)
+            patch.setattr(os, "rename", fail)
         with pytest.raises(OSError, match="No space"):
             save_state(folder, state(1))
     assert same(load_state(folder), state(0))
@@ -133,16 +133,16 @@ def test_an_interrupted_save_leaves_the_old_state(tmp_path: Path, monkeypatch: p
 def test_death_between_the_two_renames_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "c"
     save_state(folder, state(0))
-    rename, calls = Path.rename, []
+    rename, calls = os.rename, []
 
-    def second_fails(self: Path, target: Path) -> Path:
+    def second_fails(source: Path, target: Path) -> None:
         calls.append(target)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return rename(self, target)
+        rename(source, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", second_fails)
+        patch.setattr(os, "rename", second_fails)
         with pytest.raises(KeyboardInterrupt):
             save_state(folder, state(1))
     assert same(load_state(folder), state(0))

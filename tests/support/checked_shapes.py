@@ -12,6 +12,7 @@ CHECKED = [
     "popgen.methods.xpm_wm.world_model",
     "popgen.methods.xpm_wm.latent_filter",
     "popgen.methods.xpm_wm.agent",
+    "popgen.methods.xpm_wm.imagination",
     "popgen.methods.xpm_wm.actor_critic",
 ]
 """Modules whose public functions name the dimensions of their arrays."""

@@ -148,11 +148,15 @@ class HiptRun(EgoRun):
     """The two levels."""
 
 
-class FcpRun(EgoRun):
+class EgoFcpRun(EgoRun):
     """A flat ego beside many partners."""
 
     method: Literal["ego_fcp"] = "ego_fcp"
     """Name of the method."""
+
+
+FcpRun = EgoFcpRun
+"""The name by which `popgen.cli.bench_commands` still asks for it."""
 
 
 class BrRun(EgoRun):

@@ -1,4 +1,4 @@
-"""PPO of a recurrent ego, of one level or two, beside critics that are told seat and partner.
+"""PPO of a recurrent ego, of one level or two, beside critics that see seat and partner.
 
 The objective is `popgen.losses.policy_losses`. One optimiser, one summed loss: both levels learn in the same unroll of
 the memory through each sequence, whose state at the beginning is the rollout's.
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.losses.policy_losses import clipped_loss, gae, linear
+from popgen.losses.policy_losses import clipped_loss, gae, linear_schedule
 from popgen.methods.ego.augmented_starts import AugmentedStarts
 from popgen.methods.ego.config import AugmentConfig, EgoConfig, EgoRun, HiptConfig
 from popgen.methods.ego.ego_networks import EgoNet, EgoSizes
@@ -237,7 +237,9 @@ class EgoLearner:
         low = self._aim_low(rollout)
         high = None if rollout.choices is None else self._aim_high(rollout, rollout.choices, figures)
         batch = _make_sequences(rollout, low, high, config.sequence)
-        rate = linear(config.learning_rate, config.learning_rate * config.learning_rate_end, self.progress, 1.0)
+        rate = linear_schedule(
+            config.learning_rate, config.learning_rate * config.learning_rate_end, self.progress, 1.0
+        )
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         count = batch["state"].shape[1]
@@ -259,7 +261,7 @@ class EgoLearner:
         encoded = encoded.unflatten(0, batch["reward_rows"].shape)
         memory = net.remember(encoded, batch["state"][0], batch["is_first"]).outputs
         logits = net.action_logits(memory, batch.get("skill"))
-        entropy_scale = linear(config.entropy, config.entropy * config.entropy_end, self.progress, 1.0)
+        entropy_scale = linear_schedule(config.entropy, config.entropy * config.entropy_end, self.progress, 1.0)
         low = Level("low", self._critic("low"), config.clip, entropy_scale, config.value_weight)
         terms = lose_level(low, batch, logits, batch["actions"], batch["log_prob"])
         if self.setup.levels is not None:

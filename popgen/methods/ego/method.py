@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from popgen.methods.ego.config import BrRun, FcpRun, HiptRun, SpAugRun, SpRun
+from popgen.methods.ego.config import BrRun, EgoFcpRun, HiptRun, SpAugRun, SpRun
 from popgen.methods.ego.needs import check_run, estimate_needs, list_actors
 from popgen.methods.ego.recipes import ALONE_RECIPES, BR_RECIPES, FLAT_RECIPES, HIPT_RECIPES
 from popgen.methods.method import Method
@@ -36,7 +36,7 @@ FCP = _make_ego(
     summary="A recurrent ego of one level beside a population.",
     colour="#332288",
     marker="X",
-    config=FcpRun,
+    config=EgoFcpRun,
     recipes=FLAT_RECIPES,
 )
 

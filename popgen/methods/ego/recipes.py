@@ -89,4 +89,8 @@ def _make_recipes(own: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]])
 FLAT_RECIPES = _make_recipes(_BESIDE_MANY, {})
 ALONE_RECIPES = _make_recipes({}, {})
 BR_RECIPES = _make_recipes({"ego.steps": because(600_000, "one partner: one convention to learn"), "ego.envs": 64}, {})
-HIPT_RECIPES = _make_recipes(_WHOLE_EPISODES, _SKILLS)
+_TWO_LEVELS: Mapping[str, Any] = {
+    **_WHOLE_EPISODES,
+    "hipt.entropy": because(0.05, "at 0.01 one of four z falls out of use (docs/notes/ego_learning.md)"),
+}
+HIPT_RECIPES = _make_recipes(_TWO_LEVELS, _SKILLS)

@@ -145,8 +145,8 @@ class EgoTraining:
             "scores_in_training": scores,
             "seconds": round(now.seconds, 1),
         }
-        told = f", {np.mean(list(scores.values())):.2f} {self.unit} in training" if scores else ""
-        note = f"ego {self.member}: {now.steps:,} steps in {now.seconds / 60:.1f} min{told}"
+        reached = f", {np.mean(list(scores.values())):.2f} {self.unit} in training" if scores else ""
+        note = f"ego {self.member}: {now.steps:,} steps in {now.seconds / 60:.1f} min{reached}"
         critics = prefixed("critics", self.workers.critics().result())
         return TrainedMember(self.member, self.policy, critics, self.seed, extra, note=note)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from popgen.losses.policy_losses import linear
+from popgen.losses.policy_losses import linear_schedule
 from popgen.methods.mappo.config import DiversityConfig
 from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
@@ -91,7 +91,7 @@ class PlayRecord:
         own = Plan(mate=None if mate == member else mate)
         if diversity is None or not partners:
             return own
-        weight = linear(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
+        weight = linear_schedule(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
         if self.job.all_partners:
             first, *others = partners
             each = weight / len(partners)

@@ -211,7 +211,7 @@ def pool(
     """One member's batch; None where it played no self-play (a runner was lost). Each critic takes its returns into its
     statistics. `utility` pays in the reward's place, `bonus` (T, N) on top.
     """
-    own, parts, rows, told = None, [], {}, []
+    own, parts, rows, recorded = None, [], {}, []
     for kind, partner, weight in plan.sources(member):
         played, name = gather(rollouts, kind, member, partner), critic_name(kind, partner)
         if played is None or not bool(played.trained.any()):
@@ -225,14 +225,14 @@ def pool(
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
         chosen = advantage[counted]
         if kind is Kind.XP and own is not None:
-            chosen = bound_advantage(chosen, clip=plan.xp_clip, spread=own)
+            chosen = bound_advantage(chosen, clip=plan.xp_clip, unit=own)
         spread = chosen.std(correction=0).clamp(min=1e-6)
         own = spread if kind is Kind.SP else own
         if own is None:
             return None
-        scale = torch.maximum(own, spread)
+        unit = torch.maximum(own, spread)
         centred = torch.zeros_like(advantage)
-        centred[counted] = signed_advantage(kind, chosen - chosen.mean(), weight=weight, scale=scale)
+        centred[counted] = signed_advantage(kind, chosen - chosen.mean(), weight=weight, unit=unit)
         parts.append(_policy_rows(played, centred, kind))
         critic.see(returns[counted].to(critic.mean.device), value_decay)
         rows[name] = _critic_rows(played, critic, returns, counted, view)
@@ -240,17 +240,17 @@ def pool(
             f"{label}_advantage_std": float(chosen.std(correction=0)),
             f"{label}_explained": _explained_share(chosen, returns[counted]),
         }
-        told.append(figures)
+        recorded.append(figures)
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return PooledBatch(**joined, critics=rows, figures=_average_figures(told))
+    return PooledBatch(**joined, critics=rows, figures=_average_figures(recorded))
 
 
-def _average_figures(told: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def _average_figures(recorded: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """With several partners of a kind, means over them."""
     found: dict[str, list[float]] = {}
-    for figures in told:
+    for figures in recorded:
         for name, value in figures.items():
             found.setdefault(name, []).append(value)
     return {name: sum(values) / len(values) for name, values in found.items()}

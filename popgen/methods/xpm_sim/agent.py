@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.losses.policy_losses import bound_advantage, clipped_loss, linear, reinforce, signed_advantage
+from popgen.losses.policy_losses import bound_advantage, clipped_loss, linear_schedule, reinforce, signed_advantage
 from popgen.methods.xpm_sim.advantages import Actions, WeightedActions
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.critics import CriticBatch, Evaluation, MemberCritics
@@ -39,7 +39,7 @@ class PolicyTarget:
     Attributes:
         parts: its actions with signed advantages.
         lesson: what the critic of that play learns.
-        spread: deviation of the advantages before they were signed.
+        spread: deviation of the advantages before they were signed; self-play's is the unit of all.
         figures: for the logs.
     """
 
@@ -64,7 +64,7 @@ def self_play_target(config: XpmSimConfig, batch: SimulatedBatch, evaluation: Ev
     columns, advantage = batch.columns, evaluation.advantage
     spread = advantage[batch.valid[:, columns.self_play]].std().clamp(min=1e-6)
     # Centred as usual: a shift of all advantages only adds noise.
-    signed = signed_advantage(Kind.SP, advantage - advantage.mean(), weight=1.0, scale=spread)
+    signed = signed_advantage(Kind.SP, advantage - advantage.mean(), weight=1.0, unit=spread)
     parts = []
     for part, weight in ((columns.started, config.sp_weight), (columns.restarted, config.restart_weight)):
         for seat in range(players := batch.actions.shape[-1]):
@@ -76,12 +76,12 @@ def self_play_target(config: XpmSimConfig, batch: SimulatedBatch, evaluation: Ev
 
 
 def cross_play_target(
-    batch: SimulatedBatch, evaluation: Evaluation, *, weight: float, spread: float, clip: float
+    batch: SimulatedBatch, evaluation: Evaluation, *, weight: float, unit: float, clip: float
 ) -> PolicyTarget:
-    """-lambda_XP J_XP: advantages in units of self-play's `spread`, at most `clip` of them (0: without a bound)."""
+    """-lambda_XP J_XP: advantages are divided by self-play's `unit` and clipped to +-`clip` units (0: no bound)."""
     advantage = evaluation.advantage
-    bounded = bound_advantage(advantage, clip=clip, spread=spread)
-    signed = signed_advantage(Kind.XP, bounded, weight=weight, scale=spread)
+    bounded = bound_advantage(advantage, clip=clip, unit=unit)
+    signed = signed_advantage(Kind.XP, bounded, weight=weight, unit=unit)
     seats = torch.from_numpy(batch.columns.seats)
     parts = [WeightedActions(Actions.of_seats(batch, batch.columns.cross_play, seats, signed), 1.0)]
     figures = {"advantage_xp": float(advantage.std()), "return_xp": float(evaluation.lesson.returns.mean())}
@@ -180,11 +180,11 @@ class XpmSimLearner:
         self.updates += 1
         return figures | simulated_figures(batch, self.env.spec.horizon)
 
-    def cross_play(self, batch: SimulatedBatch, partner: int, spread: float) -> PolicyTarget:
-        """What the cross-play columns with `partner` teach, in units of self-play's `spread`."""
+    def cross_play(self, batch: SimulatedBatch, partner: int, unit: float) -> PolicyTarget:
+        """What the cross-play columns with `partner` teach, in self-play's `unit`."""
         evaluation = self.evaluator.evaluate_cross_play(batch, partner)
         weight = self.lambda_now() * self.constraint.pressure(list(self.partners))
-        target = cross_play_target(batch, evaluation, weight=weight, spread=spread, clip=self.config.xp_clip)
+        target = cross_play_target(batch, evaluation, weight=weight, unit=unit, clip=self.config.xp_clip)
         return replace(target, figures=target.figures | {"partner": float(partner)})
 
     def batch_columns(self, partner: int | None) -> BatchColumns:
@@ -207,7 +207,7 @@ class XpmSimLearner:
         config = self.config
         if self.updates >= config.lambda_until * config.updates:
             return 0.0
-        return linear(0.0, config.lambda_xp, self.updates + 1, config.lambda_ramp)
+        return linear_schedule(0.0, config.lambda_xp, self.updates + 1, config.lambda_ramp)
 
     # ---- losses --------------------------------------------------------------------------------------------------
 

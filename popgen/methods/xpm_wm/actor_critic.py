@@ -226,7 +226,7 @@ class AgentNetworks:
         self.config, self.model_config, self.device, self.dtype = config, model_config, device, dtype
         torch.manual_seed(seed)
         self.actor = Actor(config, model_config, num_actions).to(device)
-        self.scale = ReturnScale(config.return_percentiles).to(device)
+        self.return_range = ReturnScale(config.return_percentiles).to(device)
         self.critics = nn.ModuleDict({str(key): self._fresh_critic() for key in (SELF, *partners)})
         self.slow = copy.deepcopy(self.critics).requires_grad_(False)
         self.actor_optimiser = self._make_optimiser(self.actor, config.actor_lr)
@@ -281,7 +281,7 @@ class AgentNetworks:
             "actor": w.weights_of(self.actor),
             "critics": w.weights_of(self.critics),
             "slow": w.weights_of(self.slow),
-            "scale": w.weights_of(self.scale),
+            "scale": w.weights_of(self.return_range),
             "actor_optimiser": w.optimiser_state(self.actor_optimiser),
             "critic_optimiser": w.optimiser_state(self.critic_optimiser),
         }
@@ -291,7 +291,7 @@ class AgentNetworks:
         w.load_weights(self.actor, state["actor"])
         w.load_weights(self.critics, state["critics"])
         w.load_weights(self.slow, state["slow"])
-        w.load_weights(self.scale, state["scale"])
+        w.load_weights(self.return_range, state["scale"])
         w.load_weights(self.rollout_actor, state["actor"], cast=True)
         w.load_optimiser_state(self.actor_optimiser, state["actor_optimiser"])
         w.load_optimiser_state(self.critic_optimiser, state["critic_optimiser"])

@@ -22,7 +22,7 @@ from popgen.losses.policy_losses import (
     clipped_loss,
     geometric,
     lambda_return,
-    linear,
+    linear_schedule,
     reinforce,
     signed_advantage,
 )
@@ -58,21 +58,24 @@ def cross_play_weight(config: AgentConfig, updates: int) -> float:
     full strength from the start it keeps self-play from starting at all.
     """
     start = min(config.lambda_start, config.lambda_xp)
-    return linear(start, config.lambda_xp, updates, config.lambda_ramp)
+    return linear_schedule(start, config.lambda_xp, updates, config.lambda_ramp)
 
 
-def entropy_scale(config: AgentConfig, discovery: DiscoveryConfig, finding: int, playing: int) -> float:
-    """Of the bonus: `entropy`, then falling to `found_entropy` over the updates since the dearest event was found, and
-    to `entropy_end` over those since self-play has started, each within `entropy_ramp` and by the same factor in each.
+def entropy_scale(
+    config: AgentConfig, discovery: DiscoveryConfig, updates_since_discovery: int, updates_since_self_play: int
+) -> float:
+    """Scale of the entropy bonus: `entropy`, then falling to `found_entropy` over the updates since the highest-paying
+    event was found, and to `entropy_end` over those since real self-play has begun, each within `entropy_ramp` and by
+    the same factor in each.
 
     In units of the returns' range, which grows tenfold once dishes are delivered, advantages shrink: a scale that lets
     self-play start would then win over them, and the policy would get more random the better it plays.
     """
     scale, ramp = config.entropy, config.entropy_ramp
-    if ramp and finding:
-        scale = geometric(scale, min(discovery.found_entropy, scale), finding, ramp)
-    if ramp and playing:
-        scale = geometric(scale, min(config.entropy_end, scale), playing, ramp)
+    if ramp and updates_since_discovery:
+        scale = geometric(scale, min(discovery.found_entropy, scale), updates_since_discovery, ramp)
+    if ramp and updates_since_self_play:
+        scale = geometric(scale, min(config.entropy_end, scale), updates_since_self_play, ramp)
     return scale
 
 
@@ -88,20 +91,26 @@ def rollout_dtype(precision: str, device: torch.device = torch.device("cpu")) ->
 # ---- targets and losses ----------------------------------------------------------------------------------------------
 
 
+Seats = Int[Tensor, " B"]
+"""The member's seat in each row of imagined cross-play."""
+
+Unit = Float[Tensor, ""]
+"""What advantages are divided by."""
+
 LEAST_SPREAD = 0.1
-"""Of self-play's advantages, in units of reward: where nothing is at stake, noise is not blown up."""
+"""Least spread of self-play's advantages, in reward: as a unit it blows up no noise where nothing is at stake."""
 
 
 class ReturnTargets(NamedTuple):
-    """Lambda-returns (H, B) and values (H + 1, B), without gradient."""
+    """Lambda-returns and values, without gradient."""
 
     returns: Float[Tensor, "H B"]
-    value: Float[Tensor, "T B"]
+    value: Float[Tensor, "H+1 B"]
 
 
 @torch.no_grad()
 def estimate_returns(networks: AgentNetworks, imagined: Imagined, key: int, seat: Int[Tensor, "T B"]) -> ReturnTargets:
-    """Lambda-returns under the slow critic of `key`, which is told the agent's seat."""
+    """Lambda-returns under the slow critic of `key`, which also sees the agent's `seat` in each of T = H + 1 states."""
     value = networks.critic(key, slow=True).value(imagined.latent, seat)
     discount = networks.config.discount * imagined.keep
     return ReturnTargets(lambda_return(imagined.reward, value, discount, networks.config.lam), value)
@@ -123,7 +132,7 @@ class PolicyTarget:
 
 
 class Losses(NamedTuple):
-    """Of the policy and of a critic, to be minimised, and the policy's figures."""
+    """Losses of the policy and of a critic, to be minimised, and the policy's figures."""
 
     policy: Float[Tensor, ""]
     critic: Float[Tensor, ""]
@@ -138,21 +147,27 @@ class PolicyTerms(NamedTuple):
 
 
 def self_play_target(networks: AgentNetworks, imagined: Imagined, entropy_scale: float) -> PolicyTarget:
-    """+J_SP. The unit of all advantages is the range of the returns, or the advantages' spread."""
+    """+J_SP. The unit of all advantages is the range of the returns, or the advantages' spread.
+
+    Args:
+        networks: actor, critics and the running range of the returns, which takes this batch in.
+        imagined: self-play, (H, B).
+        entropy_scale: of the entropy bonus.
+    """
     steps, batch = imagined.reward.shape
     players = torch.tensor([0, 1], device=networks.device).expand(batch, 2)
     returns, value = estimate_returns(networks, imagined, SELF, players[:, 0].expand(steps + 1, batch))
-    advantage, scale = returns - value[:-1], networks.scale.update(returns)
-    unit = scale
+    advantage, return_range = returns - value[:-1], networks.return_range.update(returns)
+    unit = return_range
     if networks.config.advantage_unit == "spread":  # centred as usual: a shift of all advantages only adds noise
         running = advantage[imagined.running > 0.5]
         advantage, unit = advantage - running.mean(), running.std().clamp(min=LEAST_SPREAD)
         if networks.config.advantage_clip:
             advantage, unit = clip_advantages(advantage, imagined.running > 0.5, networks.config.advantage_clip)
-    signed = signed_advantage(Kind.SP, advantage, weight=1.0, scale=unit)
+    signed = signed_advantage(Kind.SP, advantage, weight=1.0, unit=unit)
     figures = {
         "entropy_scale": entropy_scale,
-        "return_scale": float(scale),
+        "return_scale": float(return_range),
         "imagined_shaped_sp": float(imagined.reward.mean()),
         "imagined_return_sp": float(returns.mean()),
         "value_sp": float(value.mean()),
@@ -175,18 +190,28 @@ def cross_play_target(
     networks: AgentNetworks,
     imagined: Imagined,
     partner: int,
-    seats: Int[Tensor, " B"],
+    seats: Seats,
     *,
-    unit: Float[Tensor, ""],
+    unit: Unit,
     weight: float,
     entropy_scale: float,
 ) -> PolicyTarget:
-    """-lambda_XP J_XP with `partner`, in self-play's `unit`, at most `agent.xp_clip` of them; `weight` is lambda_XP."""
+    """-lambda_XP J_XP with `partner`. Advantages are divided by `unit` and clipped to +-`agent.xp_clip` units.
+
+    Args:
+        networks: actor and critics.
+        imagined: cross-play, (H, B).
+        partner: whose critic gives the values.
+        seats: (B,) int64, the agent's seat.
+        unit: self-play's.
+        weight: lambda_XP times the partners' pressure (`PartnerConstraint.pressure`; 1 without a constraint).
+        entropy_scale: of the entropy bonus; `AgentLearner.cross_play` scales self-play's by `weight` too.
+    """
     steps, batch = imagined.reward.shape
     returns, value = estimate_returns(networks, imagined, partner, seats.expand(steps + 1, batch))
     advantage = returns - value[:-1]
-    bounded = bound_advantage(advantage, clip=networks.config.xp_clip, spread=unit)
-    signed = signed_advantage(Kind.XP, bounded, weight=weight, scale=unit)
+    bounded = bound_advantage(advantage, clip=networks.config.xp_clip, unit=unit)
+    signed = signed_advantage(Kind.XP, bounded, weight=weight, unit=unit)
     figures = {
         "imagined_shaped_xp": float(imagined.reward.mean()),
         "imagined_return_xp": float(returns.mean()),
@@ -216,7 +241,7 @@ def policy_terms(actor: Actor, samples: Samples) -> PolicyTerms:
 
 
 def sample_losses(networks: AgentNetworks, samples: Samples) -> Losses:
-    """Of the policy and of the critic of the samples."""
+    """Losses of the policy and of the samples' critic."""
     log_prob, entropy = policy_terms(networks.actor, samples)
     advantage, running = samples.advantage.unsqueeze(-1), samples.running.unsqueeze(-1)
     figures, clip = {"entropy": float(entropy.detach().mean())}, networks.config.clip
@@ -267,7 +292,7 @@ def step_networks(networks: AgentNetworks, parts: Sequence[Samples]) -> dict[str
 class AgentLearner:
     """Actor, one self-play critic and one cross-play critic per partner of member `member`.
 
-    Set the world model, start states and partners, then call `update`; set `plays` once real self-play has started.
+    Set the world model, start states and partners, then call `update`; real play tells when `self_play_has_begun`.
     Tensors are on `device`, weights come and go as arrays. Generators differ between devices, initial weights do not.
     """
 
@@ -284,23 +309,21 @@ class AgentLearner:
         self.config, self.model_config, self.spec, self.member = config, model_config, spec, member
         self.device = torch.device(device)
         self.dtype = rollout_dtype(config.precision, self.device)
-        self.generator = torch.Generator(self.device).manual_seed(seed + 1)
-        self.rng = np.random.default_rng(seed + 2)
+        self.generator, self.rng = torch.Generator(self.device).manual_seed(seed + 1), np.random.default_rng(seed + 2)
         self.model = WorldModel(model_config, spec).to(self.device, self.dtype).eval().requires_grad_(False)
         self.discovery = Discovery(discovery or DiscoveryConfig(), spec, model_config.view, self.device)
         self.partners: dict[int, Actor] = {}
         self.starts: Starts | None = None
-        self.new_share = 0.0
         self.partner_scores: dict[int, float] = {}
         self.imagined_scores: dict[int, float] = {}
         self.constraint = PartnerConstraint(config.xp_limit, config.multiplier_step)
-        self.plays = False
+        self.self_play_has_begun, self.new_share = False, 0.0
         self.networks = self._fresh_networks(seed)
-        self.updates = self.playing = self.finding = 0
+        self.updates = self.updates_since_self_play = self.updates_since_discovery = 0
 
     def _fresh_networks(self, seed: int) -> AgentNetworks:
-        actions = self.spec.num_actions
-        return AgentNetworks(self.config, self.model_config, actions, self.partners, seed, self.device, self.dtype)
+        sizes = self.config, self.model_config, self.spec.num_actions
+        return AgentNetworks(*sizes, self.partners, seed, self.device, self.dtype)
 
     @property
     def actor(self) -> Actor:
@@ -315,7 +338,7 @@ class AgentLearner:
     def restart(self, seed: int) -> None:
         """Fresh actor, critics and return scale: the world model stays."""
         self.networks = self._fresh_networks(seed)
-        self.updates = self.playing = self.finding = 0
+        self.updates = self.updates_since_self_play = self.updates_since_discovery = 0
 
     def add_partner(self, member: int, actor_weights: w.Weights) -> None:
         """A frozen predecessor, with a critic of its own; it acts on the current world model's latents."""
@@ -358,8 +381,8 @@ class AgentLearner:
         figures |= learn_batch(self.networks, [target.samples for target in targets], self.generator)
         self.networks.update_copies()
         self.updates += 1
-        self.playing += self.plays
-        self.finding += self.discovery.found()
+        self.updates_since_self_play += self.self_play_has_begun
+        self.updates_since_discovery += self.discovery.found()
         return figures
 
     def lambda_now(self) -> float:
@@ -368,7 +391,8 @@ class AgentLearner:
 
     def entropy_now(self) -> float:
         """Entropy scale of this update."""
-        return entropy_scale(self.config, self.discovery.config, self.finding, self.playing)
+        counts = self.updates_since_discovery, self.updates_since_self_play
+        return entropy_scale(self.config, self.discovery.config, *counts)
 
     def imagine_play(self, partner: int | None) -> ImaginedPlay:
         """A batch of imagined self-play and, with a partner, of cross-play."""
@@ -382,7 +406,7 @@ class AgentLearner:
         return ImaginedPlay(self._imagine(act, rows), seats)
 
     def start_states(self, rows: np.ndarray) -> Latent:
-        """Stored states as the world model's."""
+        """The stored model states of `rows`, on the learner's device."""
         assert self.starts is not None
         return start_latents(self.starts, rows, self.model_config.classes, self.device, self.dtype)
 
@@ -426,8 +450,8 @@ class AgentLearner:
         figures = {name: float(bonus.mean()) for name, bonus in bonuses.items()}
         return replace(target, figures=target.figures | figures | {"imagined_shaped_sp": float(imagined.reward.mean())})
 
-    def cross_play(self, imagined: Imagined, partner: int, seats: Tensor, unit: Tensor) -> PolicyTarget:
-        """-lambda_XP J_XP, in self-play's unit; what is earned with the partner is remembered."""
+    def cross_play(self, imagined: Imagined, partner: int, seats: Seats, unit: Unit) -> PolicyTarget:
+        """-lambda_XP J_XP and the entropy bonus at the same weight; what is earned with the partner is remembered."""
         weight = self.lambda_now() * self.constraint.pressure(list(self.partners))
         target = cross_play_target(
             self.networks, imagined, partner, seats, unit=unit, weight=weight, entropy_scale=self.entropy_now() * weight
@@ -448,8 +472,8 @@ class AgentLearner:
             "generator": self.generator.get_state().numpy(),
             "rng": self.rng.bit_generator.state,
             "updates": self.updates,
-            "playing": self.playing,
-            "finding": self.finding,
+            "playing": self.updates_since_self_play,
+            "finding": self.updates_since_discovery,
             "discovery": self.discovery.state(),
             "partner_scores": {str(k): v for k, v in self.partner_scores.items()},
             "imagined_scores": {str(k): v for k, v in self.imagined_scores.items()},
@@ -460,7 +484,8 @@ class AgentLearner:
         self.networks.load_state(state)
         self.generator.set_state(torch.from_numpy(np.array(state["generator"])))
         self.rng.bit_generator.state = state["rng"]
-        self.updates, self.playing, self.finding = (int(state[name]) for name in ("updates", "playing", "finding"))
+        self.updates, self.updates_since_self_play = int(state["updates"]), int(state["playing"])
+        self.updates_since_discovery = int(state["finding"])
         self.discovery.load_state(state["discovery"])
         self.partner_scores = {int(k): float(v) for k, v in state["partner_scores"].items()}
         self.imagined_scores = {int(k): float(v) for k, v in state["imagined_scores"].items()}
@@ -470,7 +495,7 @@ def find_bonuses(learner: AgentLearner, imagined: Imagined) -> dict[str, Tensor]
     """What imagined self-play earns beside the reward, (H, B) by name: for states that were seldom seen, and for what
     the population seldom does."""
     found: dict[str, Tensor] = {}
-    if scale := learner.discovery.bonus_scale(learner.plays):
+    if scale := learner.discovery.bonus_scale(learner.self_play_has_begun):
         found["count_bonus"] = learner.discovery.bonus(learner.model, imagined.latent[1:], scale)
     if learner.config.surprise and learner.partners:
         actors = [*learner.partners.values(), learner.networks.rollout_actor]

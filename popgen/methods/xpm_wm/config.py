@@ -356,12 +356,13 @@ class DiscoveryConfig(Schema):
 
     count_bonus: Weight = 0.0
     """In imagined self-play each player also earns this / sqrt(1 + n), n the real steps in which a player's own state
-    (a view's `own` entries) was the same. Half of it once the dearest event is found, none once self-play has begun."""
+    (a view's `own` entries) was the same. Half of it once the highest-paying event is found, none once self-play has
+    begun."""
     found_events: NonNegative = 0
-    """So often must the dearest event have been seen in real play to count as found; 0: it never does."""
+    """So often must the highest-paying event have been seen in real play to count as found; 0: it never does."""
     found_entropy: Weight = 0.03
-    """Scale to which the entropy bonus falls, within `agent.entropy_ramp` updates, once the dearest event is found; it
-    falls further, to `agent.entropy_end`, once self-play has begun."""
+    """Scale to which the entropy bonus falls, within `agent.entropy_ramp` updates, once the highest-paying event is
+    found; it falls further, to `agent.entropy_end`, once self-play has begun."""
     rare_events: NonNegative = 0
     """An imagined event that real play has shown fewer times is paid and ends its trajectory, and imagination does not
     start from what follows it in a window: the model knows too little of that."""

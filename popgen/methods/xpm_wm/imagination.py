@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from popgen.envs.contract import EnvSpec
@@ -66,19 +67,27 @@ def _draw_mixture(pools: list[np.ndarray], shares: np.ndarray, count: int, rng: 
 # ---- the rollout -----------------------------------------------------------------------------------------------------
 
 
-JointActor = Callable[[Latent], Tensor]
-"""Joint actions (B, P) int64 for a batch of model states."""
+JointActor = Callable[[Latent], Int[Tensor, "B P"]]
+"""Joint actions for a batch of model states."""
 
 
 @dataclass(frozen=True)
 class Imagined:
-    """latent: h (H + 1, B, D), z (H + 1, B, C * G); actions (H, B, P); reward, keep, running (H, B)."""
+    """Trajectories of H steps in B columns, on one device.
+
+    Attributes:
+        latent: model states, h (H + 1, B, D) and z (H + 1, B, C * G); the first are those to start from.
+        actions: of both players.
+        reward: what each step earned.
+        keep: probability that the episode goes on after the step.
+        running: probability that it still ran before the step.
+    """
 
     latent: Latent
-    actions: Tensor
-    reward: Tensor
-    keep: Tensor
-    running: Tensor
+    actions: Int[Tensor, "H B P"]
+    reward: Float[Tensor, "H B"]
+    keep: Float[Tensor, "H B"]
+    running: Float[Tensor, "H B"]
 
     def of_columns(self, columns: slice) -> Imagined:
         """Part of the batch."""
@@ -92,10 +101,10 @@ class Imagined:
 
 
 class Paid(NamedTuple):
-    """What arriving in states (H, B) earned, and the probability that the episode goes on from them."""
+    """What arriving in states earned, and the probability that the episode goes on from them."""
 
-    reward: Tensor
-    keep: Tensor
+    reward: Float[Tensor, "*batch"]
+    keep: Float[Tensor, "*batch"]
 
 
 Pay = Callable[[WorldModel, Latent], Paid]
@@ -131,10 +140,10 @@ def imagine(
 
 
 class ImaginedPlay(NamedTuple):
-    """Self-play columns and, after them, cross-play columns; in the latter, the agent's seat (C,) int64."""
+    """B columns of self-play and, after them, N of cross-play; in the latter, the agent's seat."""
 
     imagined: Imagined
-    seats: Tensor
+    seats: Int[Tensor, " N"]
 
 
 def draw_start_rows(
@@ -154,17 +163,19 @@ def start_latents(starts: Starts, rows: np.ndarray, classes: int, device: torch.
     return Latent(torch.from_numpy(starts.h[rows]).to(device, dtype), z.to(dtype))
 
 
-def cross_play_seats(count: int, device: torch.device) -> Tensor:
-    """(count,) the agent's seat: 0 in the first half, 1 in the second."""
+def cross_play_seats(count: int, device: torch.device) -> Int[Tensor, " {count}"]:
+    """The agent's seat: 0 in the first half, 1 in the second."""
     return (torch.arange(count, device=device) >= count // 2).long()
 
 
-def joint_actor(own: Actor, partner: Actor | None, first: int, seats: Tensor, generator: torch.Generator) -> JointActor:
+def joint_actor(
+    own: Actor, partner: Actor | None, first: int, seats: Int[Tensor, " N"], generator: torch.Generator
+) -> JointActor:
     """Both seats by `own`, but for the other seat than `seats` in the columns from `first` on, which is `partner`'s."""
     both = torch.tensor([0, 1], device=seats.device)
     columns = first + torch.arange(len(seats), device=seats.device)
 
-    def act(latent: Latent) -> Tensor:
+    def act(latent: Latent) -> Int[Tensor, "B P"]:
         pair = latent.expand_players()
         actions = own.sample(pair, both.expand(pair.h.shape[:-1]), generator)
         if partner is not None:
@@ -181,31 +192,41 @@ def joint_actor(own: Actor, partner: Actor | None, first: int, seats: Tensor, ge
 class Samples:
     """R imagined states of one pair of policies; no gradient flows into them.
 
-    key: of the critic that learns from them.
-    latent: (R, .), seat: (R,) int64, what that critic sees; returns: (R,), its targets.
-    seats, actions: (R, K) int64, where the member sat and what it did: K is 2 in self-play, 1 in cross-play.
-    advantage: (R,), with the objective's sign, weight and unit.
-    running: (R,), probability that the imagined episode still runs.
-    entropy_scale: of the bonus in these states.
-    log_prob: (R, K), of the actions under the policy that took them; None where one step is taken on the whole batch.
+    Attributes:
+        key: of the critic that learns from them.
+        latent: h (R, D) and z (R, C * G), what that critic sees.
+        seat: what it sees beside them.
+        returns: its targets.
+        seats: where the member sat: K is 2 in self-play, 1 in cross-play.
+        actions: what it did there.
+        advantage: with the objective's sign, weight and unit.
+        running: probability that the imagined episode still runs.
+        entropy_scale: of the bonus in these states.
+        log_prob: of the actions under the policy that took them; None where one step is taken on the whole batch.
     """
 
     key: int
     latent: Latent
-    seat: Tensor
-    returns: Tensor
-    seats: Tensor
-    actions: Tensor
-    advantage: Tensor
-    running: Tensor
+    seat: Int[Tensor, " R"]
+    returns: Float[Tensor, " R"]
+    seats: Int[Tensor, "R K"]
+    actions: Int[Tensor, "R K"]
+    advantage: Float[Tensor, " R"]
+    running: Float[Tensor, " R"]
     entropy_scale: float
-    log_prob: Tensor | None = None
+    log_prob: Float[Tensor, "R K"] | None = None
 
     @staticmethod
     def from_imagined(
-        imagined: Imagined, key: int, seats: Tensor, returns: Tensor, advantage: Tensor, entropy_scale: float
+        imagined: Imagined,
+        key: int,
+        seats: Int[Tensor, "B K"],
+        returns: Float[Tensor, "H B"],
+        advantage: Float[Tensor, "H B"],
+        entropy_scale: float,
     ) -> Samples:
-        """Trajectories (H, B) in one row each: `seats` (B, K) int64 are the member's, the critic is told the first."""
+        """A row for each of the R = H * B states of trajectories: `seats` are the member's, the critic sees the first
+        of them."""
         steps, batch = imagined.reward.shape
         seats = seats.expand(steps, batch, -1)
         latent, actions = imagined.latent[:-1], imagined.actions.gather(-1, seats)
@@ -224,7 +245,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.returns)
 
-    def __getitem__(self, rows: Tensor) -> Samples:
+    def __getitem__(self, rows: Int[Tensor, " N"]) -> Samples:
         return replace(
             self,
             latent=self.latent[rows],
@@ -267,8 +288,8 @@ def trusted_shares(rates: Rates, factor: float) -> np.ndarray:
     return np.clip(factor * rates.real / np.maximum(rates.imagined, 1e-12), LEAST_TRUST, 1.0)
 
 
-def dearest_events(spec: EnvSpec) -> np.ndarray:
-    """(E,) bool: events that pay at least half of what the dearest pays."""
+def find_highest_paying(spec: EnvSpec) -> np.ndarray:
+    """(E,) bool: events that pay at least half of what the highest-paying one pays."""
     weights = np.asarray(spec.event_weights)
     return weights >= max(0.5 * weights.max(), 1e-9)
 
@@ -289,7 +310,7 @@ class Discovery:
         self.config, self.spec, self.view, self.device = config, spec, spec.views[view], device
         factors = [config.event_factors.get(name, 1.0) for name in spec.event_names]
         self.weights = np.asarray(spec.event_weights, np.float64) * factors
-        self.dearest = dearest_events(spec)
+        self.highest_paying = find_highest_paying(spec)
         self.tally: Tally | None = None
         self.shares = np.ones(spec.num_events)
         self.rates: Rates | None = None
@@ -301,14 +322,14 @@ class Discovery:
         return bool(self.config.event_factors or self.config.trust or self.config.rare_events)
 
     def found(self) -> bool:
-        """Whether the dearest event has been seen often enough to count as found."""
+        """Whether the highest-paying events have been seen often enough to count as found."""
         if self.tally is None or not self.config.found_events:
             return False
-        return int(self.tally.events[self.dearest].sum()) >= self.config.found_events
+        return int(self.tally.events[self.highest_paying].sum()) >= self.config.found_events
 
-    def bonus_scale(self, plays: bool) -> float:
-        """Of the count bonus: halved once the dearest event has been found, none once real self-play has begun."""
-        if plays or self.tally is None:
+    def bonus_scale(self, self_play_has_begun: bool) -> float:
+        """Scale of the count bonus: halved once the highest-paying event is found, 0 once real self-play has begun."""
+        if self_play_has_begun or self.tally is None:
             return 0.0
         return self.config.count_bonus * (0.5 if self.found() else 1.0)
 
@@ -326,9 +347,9 @@ class Discovery:
             keep = torch.where(happened.any(-1), torch.zeros_like(keep), keep)
         return Paid((events * weights.to(self.device)).sum(-1), keep)
 
-    def bonus(self, model: WorldModel, arrived: Latent, scale: float) -> Tensor:
-        """(...,) float32: for each player `scale` / sqrt(1 + n), n the real visits of the state of its own that the
-        model shows. A state with a part that was never seen is no new combination, but a blur: it earns nothing."""
+    def bonus(self, model: WorldModel, arrived: Latent, scale: float) -> Float[Tensor, "*batch"]:
+        """For each player `scale` / sqrt(1 + n), n the real visits of the state of its own that the model shows. A
+        state with a part that was never seen is no new combination, but a blur: it earns nothing."""
         assert self.tally is not None
         total = torch.zeros(arrived.h.shape[:-1], device=self.device)
         weights = part_weights(self.view)
@@ -344,7 +365,7 @@ class Discovery:
             total += self._bonus_of(values)
         return scale * total
 
-    def _bonus_of(self, values: list[Tensor]) -> Tensor:
+    def _bonus_of(self, values: list[Int[Tensor, "*batch"]]) -> Float[Tensor, "*batch"]:
         """1 / sqrt(1 + n) of states with these values of their parts."""
         assert self.tally is not None
         valid = torch.ones_like(values[0], dtype=torch.bool)
@@ -361,10 +382,10 @@ class Discovery:
     def compare(self, imagined: np.ndarray, tally: Tally) -> dict[str, float]:
         """Take in imagined events a step (E,), and the real ones since the last comparison; figures of both."""
         events, steps = self.seen
-        played = tally.own_steps - steps
-        if played < 1:
+        new_steps = tally.own_steps - steps
+        if new_steps < 1:
             return {}
-        new = Rates(imagined, (tally.own_events - events + 0.5) / played)
+        new = Rates(imagined, (tally.own_events - events + 0.5) / new_steps)
         self.seen = (tally.own_events, tally.own_steps)
         old = self.rates or new
         mixed = [(1.0 - NEWEST) * before + NEWEST * now for before, now in zip(old, new, strict=True)]

@@ -90,15 +90,14 @@ class Overlap:
                 self.done[kind] += 1
         return results
 
-    def took_in(self, kind: str, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
-        """A result has been taken in; what it took."""
+    def record_finished(self, kind: str, finished: Work) -> None:
+        """Count a task of a kind whose result has been applied, and the time that it took."""
         if self.schedule != "sync":
             before = self._done_at_start[kind]
             others = [self.done[other] - before[other] for other in self.done if other != kind]
             self.staleness[kind] = max(others, default=0)
             self.done[kind] += 1
-        work = self.work[kind]
-        self.work[kind] = Work(work.tasks + 1, work.seconds + seconds, work.cpu_seconds + cpu_seconds)
+        self.work[kind] = self.work[kind].plus(finished)
 
     def round_ended(self) -> bool:
         """Whether the slowest kind has advanced since the last call that said so."""

@@ -13,7 +13,8 @@ import numpy as np
 
 from popgen.methods.training import Pending, Phase, Progress, Round, Sampled, State
 from popgen.methods.xpm_wm.config import Phase1Config
-from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Put, Watch
+from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Put, Tally, Watch
+from popgen.methods.xpm_wm.workers import AgentTask
 from popgen.methods.xpm_wm.world_model import Starts
 from popgen.play.episodes import Episode
 from popgen.types import Weights
@@ -40,12 +41,12 @@ class FirstMemberProgress:
         mark, since_gain: the window that last counted as a gain, and the rounds since, once self-play has begun.
         confirmations: how often the last policy has been looked at by itself.
         restarted: actor and critics have started again.
-        plays: self-play has begun (`agent.entropy_after` of the target).
+        self_play_has_begun: real self-play has reached `agent.entropy_after` of the target.
         confirmed: the last policy is good by itself.
         recent, shaped: scores and shaped returns of the last episodes.
         figures: the last value of every figure.
         best: the policy of the best window.
-        published, played: the weights learned last, and those that play.
+        published, playing_weights: the weights learned last, and those that play.
         model, starts, recent_starts: of the world model's last update.
         watch: signs of trouble so far.
     """
@@ -59,14 +60,14 @@ class FirstMemberProgress:
     since_gain: int = 0
     confirmations: int = 0
     restarted: bool = False
-    plays: bool = False
+    self_play_has_begun: bool = False
     confirmed: bool = False
     recent: deque[float] = field(default_factory=deque)
     shaped: deque[float] = field(default_factory=deque)
     figures: dict[str, float] = field(default_factory=dict)
     best: Candidate | None = None
     published: MemberWeights | None = None
-    played: MemberWeights | None = None
+    playing_weights: MemberWeights | None = None
     model: Pending[Weights] | None = None
     starts: Pending[Starts] | None = None
     recent_starts: Pending[Starts] | None = None
@@ -77,12 +78,6 @@ class FirstMemberProgress:
         """The weights learned last; there are some from the first update on."""
         assert self.published is not None
         return self.published
-
-    @property
-    def imagination(self) -> tuple[Pending[Weights], Pending[Starts]]:
-        """World model and start states to imagine with; there are some from the first update on."""
-        assert self.model is not None and self.starts is not None
-        return self.model, self.starts
 
     def add_episodes(self, episodes: Sequence[Episode]) -> None:
         """Episodes that have ended; only the last `window` count."""
@@ -103,7 +98,7 @@ class FirstMemberProgress:
             "since_gain": self.since_gain,
             "confirmations": self.confirmations,
             "restarted": self.restarted,
-            "plays": self.plays,
+            "plays": self.self_play_has_begun,
             "recent": list(self.recent),
             "shaped": list(self.shaped),
             "figures": dict(self.figures),
@@ -128,7 +123,7 @@ class FirstMemberProgress:
             since_gain=int(state["since_gain"]),
             confirmations=int(state["confirmations"]),
             restarted=bool(state["restarted"]),
-            plays=bool(state["plays"]),
+            self_play_has_begun=bool(state["plays"]),
             figures={str(name): float(value) for name, value in state["figures"].items()},
             best=None if state["best"] is None else Candidate.from_state(state["best"], put),
             published=MemberWeights.from_state(state["published"], put),
@@ -139,6 +134,19 @@ class FirstMemberProgress:
         )
         progress.add_scores(map(float, state["recent"]), map(float, state["shaped"]))
         return progress
+
+
+def make_agent_task(progress: FirstMemberProgress, phase: Phase1Config, tally: Tally | None) -> AgentTask:
+    """Updates of the agent in the world model published last, from the states published with it."""
+    assert progress.model is not None and progress.starts is not None, "both are there from the first update on"
+    return AgentTask(
+        updates=phase.agent_updates,
+        model=progress.model,
+        starts=progress.starts,
+        self_play_has_begun=progress.self_play_has_begun,
+        tally=tally,
+        recent=progress.recent_starts,
+    )
 
 
 # ---- rules -----------------------------------------------------------------------------------------------------------
@@ -171,7 +179,7 @@ def reached_target(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
 
 def has_levelled_off(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
     """Plays, and has not gained for `plateau` rounds."""
-    return progress.plays and 0 < phase.plateau <= progress.since_gain
+    return progress.self_play_has_begun and 0 < phase.plateau <= progress.since_gain
 
 
 def is_done(progress: FirstMemberProgress, phase: Phase1Config) -> bool:
@@ -265,18 +273,18 @@ def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after:
     if not has_full_window(progress):
         return
     score = mean_score(progress)
-    progress.plays |= score >= entropy_after * phase.target_score
+    progress.self_play_has_begun |= score >= entropy_after * phase.target_score
     count_gain(progress, score, phase)
     if progress.best is None or score > progress.best.sp:
-        assert progress.played is not None
-        progress.best, progress.since_best = Candidate(progress.played, score, 0.0), 0
+        assert progress.playing_weights is not None
+        progress.best, progress.since_best = Candidate(progress.playing_weights, score, 0.0), 0
     else:
         progress.since_best += 1
 
 
 def count_gain(progress: FirstMemberProgress, score: float, phase: Phase1Config) -> None:
     """Of a full window, once self-play has begun."""
-    if not progress.plays:
+    if not progress.self_play_has_begun:
         return
     progress.since_gain += 1
     if score >= (1.0 + phase.least_gain) * progress.mark:

@@ -12,12 +12,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
-from popgen.methods.training import Phase, Progress, Round, State
+from popgen.methods.training import Pending, Phase, Progress, Round, State
 from popgen.methods.xpm_wm.config import Phase2Config
 from popgen.methods.xpm_wm.real_play import Candidate, MemberWeights, Put, Watch
+from popgen.methods.xpm_wm.workers import AgentTask, FittedPartners
+from popgen.methods.xpm_wm.world_model import Starts
 from popgen.play.episodes import Episode
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength
-from popgen.types import Kind
+from popgen.types import Kind, Weights
 
 IMAGINATION = "imagination"
 
@@ -31,7 +33,7 @@ class LaterMemberProgress:
         constraint: the multipliers that its scores there have led to.
         steps: environment steps so far.
         rounds: of real episodes that have ended; since_best: since the best of them.
-        plays: self-play has begun (`agent.entropy_after` of the target).
+        self_play_has_begun: real self-play has reached `agent.entropy_after` of the target.
         best: the policy of the best round.
         figures: of the last round.
         watch: signs of trouble so far.
@@ -41,7 +43,7 @@ class LaterMemberProgress:
     strength: PartnerStrength
     steps: int = 0
     rounds: int = 0
-    plays: bool = False
+    self_play_has_begun: bool = False
     best: Candidate | None = None
     figures: dict[str, float] = field(default_factory=dict)
     since_best: int = 0
@@ -64,7 +66,7 @@ class LaterMemberProgress:
         assert self.best is not None
         return {
             "rounds": self.rounds,
-            "plays": self.plays,
+            "plays": self.self_play_has_begun,
             "since_best": self.since_best,
             "watch": self.watch.to_state(),
             "best": self.best.to_state(),
@@ -78,7 +80,7 @@ class LaterMemberProgress:
         self.strength.load_state(state["strength"])
         self.constraint.load_state(state["constraint"])
         self.best = Candidate.from_state(state["best"], put)
-        self.rounds, self.plays = int(state["rounds"]), bool(state["plays"])
+        self.rounds, self.self_play_has_begun = int(state["rounds"]), bool(state["plays"])
         self.since_best, self.watch = int(state["since_best"]), Watch.from_state(state["watch"])
         self.skills = None if state["skills"] is None else SkillCheckpoints.from_state(state["skills"])
 
@@ -97,7 +99,7 @@ def most_rounds(phase: Phase2Config, episodes_xp: int, horizon: int) -> int:
     return most if phase.max_steps is None else max(1, min(most, phase.max_steps // each))
 
 
-def plays_on(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> bool:
+def wants_another_round(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> bool:
     """The configured rounds are played in any case, further ones only by a member that is still weak or, with a
     plateau, improves."""
     weak = progress.best is None or progress.best.sp < phase.target_score
@@ -181,8 +183,29 @@ class ImaginationPlan:
 
 
 def plan_imagination(rounds: int, phase: Phase2Config) -> ImaginationPlan:
-    """Of the round after `rounds`: the first one has no data of its own, and more updates."""
+    """Plan the round after `rounds`: the first one has no data of its own, and more updates."""
     if rounds == 0:
         return ImaginationPlan(phase.first_updates, 0, 0.0)
     done = phase.first_updates + (rounds - 1) * phase.updates_per_round
     return ImaginationPlan(phase.updates_per_round, done, phase.starts_new)
+
+
+def make_agent_task(
+    progress: LaterMemberProgress,
+    phase: Phase2Config,
+    *,
+    model: Pending[Weights],
+    starts: Pending[Starts],
+    partners: Pending[FittedPartners],
+) -> AgentTask:
+    """The round's task before its first update; the strongest partner so far (line 9) follows from `strength`."""
+    return AgentTask(
+        updates=0,
+        model=model,
+        starts=starts,
+        self_play_has_begun=progress.self_play_has_begun,
+        new_share=plan_imagination(progress.rounds, phase).new_share,
+        partner_scores=progress.strength.scores(),
+        multipliers=progress.constraint.multipliers,
+        partners=partners,
+    )

@@ -143,15 +143,15 @@ class Watch:
         gap: rounds in a row in which imagination paid too much.
         best_precision: of events at one step, the highest so far.
         imprecise: reports in a row that were far below it.
-        told: that imagination pays too much has been said; it is said again after a round in which it did not.
-        told_precision: the same of precision.
+        warned_of_pay: a line has said that imagination pays too much; a round in which it does not resets this.
+        warned_of_precision: the same of precision.
     """
 
     gap: int = 0
     best_precision: float = 0.0
     imprecise: int = 0
-    told: bool = False
-    told_precision: bool = False
+    warned_of_pay: bool = False
+    warned_of_precision: bool = False
 
     def look(self, figures: Mapping[str, float], report: Mapping[str, float], config: WatchConfig, rounds: int) -> str:
         """What is to be said after a round, "" if nothing.
@@ -170,12 +170,12 @@ class Watch:
         if imagined is None or real is None or not config.imagined_factor:
             return ""
         if imagined <= max(LEAST_PAY, config.imagined_factor * real):
-            self.gap, self.told = 0, False
+            self.gap, self.warned_of_pay = 0, False
             return ""
         self.gap += 1
-        if self.gap < rounds or self.told:
+        if self.gap < rounds or self.warned_of_pay:
             return ""
-        self.told = True
+        self.warned_of_pay = True
         return (
             f"imagination has paid {imagined:.2f} a step and real self-play {real:.2f} for {self.gap} rounds, the "
             "actor may be farming the world model's errors: give the model more updates (phase1.model_updates, "
@@ -188,12 +188,12 @@ class Watch:
             return ""
         self.best_precision = max(self.best_precision, precision)
         if precision >= config.precision_share * self.best_precision:
-            self.imprecise, self.told_precision = 0, False
+            self.imprecise, self.warned_of_precision = 0, False
             return ""
         self.imprecise += 1
-        if self.imprecise < config.precision_reports or self.told_precision:
+        if self.imprecise < config.precision_reports or self.warned_of_precision:
             return ""
-        self.told_precision = True
+        self.warned_of_precision = True
         return (
             f"{precision:.0%} of the events that the world model predicts a step ahead are real, "
             f"{self.best_precision:.0%} were: give it more updates or a lower learning rate "
@@ -201,15 +201,20 @@ class Watch:
         )
 
     def to_state(self) -> State:
-        """For a checkpoint."""
-        return dict(vars(self))
+        """For a checkpoint, whose keys are older than the attributes' names."""
+        counts = {"gap": self.gap, "best_precision": self.best_precision, "imprecise": self.imprecise}
+        return counts | {"told": self.warned_of_pay, "told_precision": self.warned_of_precision}
 
     @staticmethod
     def from_state(state: State) -> Watch:
         """From `to_state()`, as it was read."""
-        counts = {name: int(state[name]) for name in ("gap", "imprecise")}
-        said = {name: bool(state[name]) for name in ("told", "told_precision")}
-        return Watch(best_precision=float(state["best_precision"]), **counts, **said)
+        return Watch(
+            gap=int(state["gap"]),
+            best_precision=float(state["best_precision"]),
+            imprecise=int(state["imprecise"]),
+            warned_of_pay=bool(state["told"]),
+            warned_of_precision=bool(state["told_precision"]),
+        )
 
 
 @dataclass(frozen=True)

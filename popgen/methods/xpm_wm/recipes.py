@@ -15,9 +15,12 @@ LAPTOP = Recipe(
     "laptop",
     "Two CPU cores, minutes a member.",
     {
-        "phase1.prefill_steps": 400_000,
-        "phase1.max_steps": 1_600_000,
-        "phase1.target_score": because(10.0, "half of it tells that self-play has begun"),
+        "phase1.prefill_steps": because(
+            400_000,
+            "in forced coordination random play delivers two soups by then (docs/notes/learning.md, the same name)",
+        ),
+        "phase1.max_steps": because(1_600_000, "a budget: the plateau ends member 1 before, where it plays"),
+        "phase1.target_score": because(10.0, "half of it tells that self-play has begun; the plateau ends the phase"),
         "phase1.plateau": because(10, "member 1 learns until it gains no more; self-play is what populations are for"),
         "phase1.model_updates": because(40, "the model learns more from the few soups that there are"),
         "agent.entropy": because(0.04, _CHANCE),
@@ -25,7 +28,7 @@ LAPTOP = Recipe(
             0.02, "the model has seen soups by then (docs/notes/learning.md, What holds later members back)"
         ),
         "phase2.partner_fits": because(
-            100, "partners are themselves on the latents (docs/notes/learning.md, the same)"
+            100, "partners are themselves on the latents (docs/notes/learning.md, What holds later members back)"
         ),
         "phase2.max_rounds": because(16, "a member that is still weak after eight rounds gets some more"),
         "phase2.plateau": because(2, "so does one that still improves"),

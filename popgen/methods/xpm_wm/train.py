@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import replace
 
-from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled, named_figures
+from popgen.methods.training import Pending, Phase, Progress, Record, Round, Sampled, Work, named_figures
 from popgen.methods.xpm_wm import phase1, phase2
 from popgen.methods.xpm_wm import real_play as real
 from popgen.methods.xpm_wm.config import PREFILL_CHUNK
@@ -19,8 +19,7 @@ from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, ModelReports, 
 from popgen.play.episodes import Episode
 from popgen.types import RANDOM_MEMBER
 
-Loop = Generator[Record, bool | None, Candidate]
-Learning = Generator[Record, bool | None, MemberWeights]
+MemberLoop = Generator[Record, bool | None, Candidate]
 Records = Generator[Record, bool | None, None]
 Result = Sampled | ModelUpdate | AgentUpdate
 FIRST = 1
@@ -36,7 +35,7 @@ class FirstMember:
         self.phase, self.progress, self.tally = self.config.phase1, progress, setup.tally
         self.reports = ModelReports(self.work, self.phase.check_every, waits=self.config.run.schedule == "sync")
 
-    def train(self, resumed: bool) -> Loop:
+    def train(self, resumed: bool) -> MemberLoop:
         """Until the budget, the target or the patience ends; line 1 is done."""
         if not resumed:
             yield from self.collect_random_episodes()
@@ -93,50 +92,47 @@ class FirstMember:
                 resting = False
                 yield Round(FIRST, progress.steps, number=progress.rounds, must_save=True)
                 continue
-            sampled: list[Sampled] = []
-            for kind, result in overlap.finish():
-                overlap.took_in(kind, *self.take_in(kind, result, sampled))
+            for kind, result in (finished := overlap.finish()):
+                overlap.record_finished(kind, self.apply_result(kind, result))
+            sampled = tuple(result for _, result in finished if isinstance(result, Sampled))
             if overlap.round_ended():
-                wants_rest = yield self.end_round(overlap, tuple(sampled))
+                wants_rest = yield self.end_round(overlap, sampled)
                 resting = bool(overlap.running) and bool(wants_rest or resting)
             elif sampled:
-                yield Progress(FIRST, progress.steps, sampled=tuple(sampled))
+                yield Progress(FIRST, progress.steps, sampled=sampled)
 
     def start_task(self, kind: str) -> Pending[Sampled] | Pending[ModelUpdate] | Pending[AgentUpdate]:
         """One task of a kind, on what the others published last."""
         if kind in LEARNERS:
             return self.update_agent() if kind == "agent" else self.update_world_model(self.phase.model_updates)
-        self.progress.played = self.progress.latest
+        self.progress.playing_weights = self.progress.latest
         return self.work.start_sampling(kind, self.phase.steps_per_iteration, FIRST, self.progress.latest.acting)
 
     def update_world_model(self, updates: int) -> Pending[ModelUpdate]:
         """Lines 6 and 7. Imagination starts from chosen windows only once self-play has begun: before, the model does
         not know what follows a rare event, and nothing corrects it."""
         progress, discovery = self.progress, self.config.discovery
-        chosen = progress.plays or self.phase.event_starts == "always"
+        chosen = progress.self_play_has_begun or self.phase.event_starts == "always"
         rare = real.rare_events(self.tally(), discovery)
         recent = self.phase.envs * self.phase.steps_per_iteration if discovery.trust else 0
         return self.work.update_world_model(ModelTask(updates, self.config.agent.starts_sp, chosen, rare, recent))
 
     def update_agent(self) -> Pending[AgentUpdate]:
         """Lines 8 and 12 to 15, without partners."""
-        progress = self.progress
-        task = AgentTask(self.phase.agent_updates, *progress.imagination, 0.0, {}, progress.plays)
-        return self.work.update_agent(replace(task, tally=self.tally(), recent=progress.recent_starts))
+        return self.work.update_agent(phase1.make_agent_task(self.progress, self.phase, self.tally()))
 
-    def take_in(self, kind: str, result: Result, sampled: list[Sampled]) -> tuple[float, float]:
-        """Seconds and processor seconds that a finished task took; what it gave is the newest now."""
+    def apply_result(self, kind: str, result: Result) -> Work:
+        """Episodes into B_SP, or what a learner published as the newest; the time that the task took."""
         progress = self.progress
         if isinstance(result, Sampled):
             progress.add_episodes(self.add_to_buffers([result]))  # 18
-            sampled.append(result)
-            return 0.0, result.collected.cpu_seconds
+            return Work(1, cpu_seconds=result.collected.cpu_seconds)
         if isinstance(result, ModelUpdate):
             progress.model, progress.starts, progress.recent_starts = result.weights, result.starts, result.recent
         else:
             progress.published = result.weights
         progress.figures |= named_figures(kind, result.metrics)
-        return result.metrics["seconds"], result.metrics["cpu_seconds"]
+        return Work(1, result.metrics["seconds"], result.metrics["cpu_seconds"])
 
     def add_to_buffers(self, sampled: list[Sampled]) -> list[Episode]:
         """Lines 3 and 18: into B_SP; the episodes that ended."""
@@ -192,15 +188,17 @@ class LaterMember:
         self.most_rounds = phase2.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
         self.imagined: dict[str, float] = {}
 
-    def train(self) -> Loop:
+    def train(self) -> MemberLoop:
         """All rounds; line 1 is done."""
         phase, progress = self.phase, self.progress
         yield phase2.describe_imagination(progress, phase, self.member, self.most_rounds)
-        while phase2.plays_on(progress, phase, self.most_rounds):  # 4
-            update = None if phase.model_lag else self.update_world_model()  # 5-7
-            starts, model = self.work.cache_starts(), self.work.model_weights()  # 8, 10
-            task = AgentTask(0, model, starts, 0.0, {}, progress.plays, partners=self.work.fit_partners())
-            update = self.update_world_model() if phase.model_lag else update  # 5-7, beside 8-16
+        while phase2.wants_another_round(progress, phase, self.most_rounds):  # 4
+            if phase.model_lag:  # the agent imagines in the model of the round before, which learns meanwhile
+                task = self.prepare_imagination()
+                update = self.update_world_model()  # 5-7, beside 8-16
+            else:  # the paper's order: the agent imagines in the model that has learned from all episodes
+                update = self.update_world_model()  # 5-7
+                task = self.prepare_imagination()
             published = yield from self.learn_in_imagination(task)  # 8-16
             if update is not None:
                 yield Progress(self.member, progress.steps, named_figures("model", update.result().metrics))
@@ -214,16 +212,18 @@ class LaterMember:
         """Lines 5 to 7; there is nothing new before the first real episodes."""
         return self.work.update_world_model(ModelTask(self.phase.model_updates)) if self.progress.rounds else None
 
-    def learn_in_imagination(self, task: AgentTask) -> Learning:
-        """Lines 8 to 15, in pieces for the progress bar: simulated self-play and cross-play with the strongest partner
-        so far (9), objective (11-13), updates (14, 15)."""
+    def prepare_imagination(self) -> AgentTask:
+        """What lines 8 to 10 need: the world model as it is, states to start from, partners and their strength (9)."""
+        starts, model, partners = self.work.cache_starts(), self.work.model_weights(), self.work.fit_partners()
+        return phase2.make_agent_task(self.progress, self.phase, model=model, starts=starts, partners=partners)
+
+    def learn_in_imagination(self, task: AgentTask) -> Generator[Record, bool | None, MemberWeights]:
+        """Lines 8 to 15, in pieces for the progress bar: simulation (8, 10), objective (11-13), updates (14, 15)."""
         progress, plan = self.progress, phase2.plan_imagination(self.progress.rounds, self.phase)
-        scores, pressed, done = progress.strength.scores(), progress.constraint.multipliers, plan.done  # 9
-        further = {"new_share": plan.new_share, "partner_scores": scores, "multipliers": pressed}
-        task = replace(task, **further, tally=self.tally())
+        tally, done = self.tally(), plan.done
         while True:
-            task = replace(task, updates=min(AGENT_PIECE, plan.done + plan.updates - done))
-            update = self.work.update_agent(task).result()  # 11-15
+            task = replace(task, updates=min(AGENT_PIECE, plan.done + plan.updates - done), tally=tally)
+            update = self.work.update_agent(task).result()
             self.imagined, done = named_figures("agent", update.metrics) | {"updates": done}, done + task.updates
             yield phase2.describe_updates(progress, self.member, self.imagined, done, self.phase, self.most_rounds)
             if done == plan.done + plan.updates:
@@ -242,9 +242,9 @@ class LaterMember:
         progress, watch = self.progress, self.config.watch
         progress.steps += real.steps_of(sampled)
         scored = phase2.judge_round(progress, published, real.episodes_of(sampled), self.spec.horizon)
-        progress.plays |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
+        progress.self_play_has_begun |= scored.sp >= self.config.agent.entropy_after * self.phase.target_score
         trouble = progress.watch.look(self.imagined | progress.figures, {}, watch, watch.later_rounds)
         plan = phase2.describe_imagination(progress, self.phase, self.member, self.most_rounds)
         ended = phase2.describe_later_round(progress, plan, scored, self.spec.score_name, trouble)
-        goes_on, keeps = phase2.plays_on(progress, self.phase, self.most_rounds), progress.skills is not None
+        goes_on, keeps = phase2.wants_another_round(progress, self.phase, self.most_rounds), progress.skills is not None
         return replace(ended, sampled=tuple(sampled), at_rest=goes_on or keeps, must_save=keeps and not goes_on)

@@ -53,9 +53,9 @@ class AgentTask:
         updates: how many.
         model: the world model to imagine with.
         starts: states to start from.
+        self_play_has_begun: real self-play has reached `agent.entropy_after` of the target.
         new_share: share of the starts from this member's own data.
         partner_scores: each partner's return in real cross-play, of those seen.
-        plays: real self-play has begun.
         tally: of real play, where anything goes by it.
         recent: states of this member's latest self-play; None: those among `starts`.
         multipliers: of each partner's cross-play, where that is a constraint; 1 for those that are not there.
@@ -65,9 +65,9 @@ class AgentTask:
     updates: int
     model: Pending[Weights]
     starts: Pending[Starts]
-    new_share: float
-    partner_scores: dict[int, float]
-    plays: bool
+    self_play_has_begun: bool
+    new_share: float = 0.0
+    partner_scores: Mapping[int, float] = field(default_factory=dict[int, float])
     tally: Tally | None = None
     recent: Pending[Starts] | None = None
     multipliers: Mapping[int, float] = field(default_factory=dict[int, float])

@@ -44,6 +44,11 @@ def read_record(path: Path) -> Record:
     return values
 
 
+def name_record(record: Record) -> str:
+    """What its file is called: records of one target with other settings stand beside each other."""
+    return "-".join([record["target"], record["budget"], *sorted(record["settings"])]).replace("/", "_")
+
+
 def to_record_text(record: Record) -> str:
     """The JSON text of a record."""
     return json.dumps(record, indent=1, sort_keys=True, allow_nan=False) + "\n"
@@ -64,13 +69,22 @@ def read_records(folder: Path) -> list[Record]:
 
 def to_page(records: Sequence[Record]) -> str:
     """The page of measured results."""
-    return "\n".join([_HEAD, *(to_section(record) for record in records)])
+    counts = Counter(record["target"] for record in records)
+    sections = (to_section(record, named=counts[record["target"]] > 1) for record in records)
+    return "\n".join([_HEAD, *sections])
 
 
-def to_section(record: Record, level: int = 2) -> str:
-    """A target's part of the page: the paper's claim, tables, what is missing, and where the figures come from."""
+def to_section(record: Record, level: int = 2, *, named: bool = False) -> str:
+    """A target's part of the page: the paper's claim, tables, what is missing, and where the figures come from.
+
+    Args:
+        record: of the target.
+        level: of the heading.
+        named: the heading says the settings, which tell this record from another of the same target.
+    """
     target = TARGETS[record["target"]]
-    lines = [f"{'#' * level} {target.title}", ""]
+    settings = f", {', '.join(record['settings'])}" if named and record["settings"] else ""
+    lines = [f"{'#' * level} {target.title}{settings}", ""]
     if target.source:
         lines += [_wrap_text(f"The paper's {target.source}: {target.claim}"), ""]
     lines += ["```sh", record["command"], "```", ""]

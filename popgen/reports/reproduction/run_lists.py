@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from popgen.methods.registry import METHODS, find_objective, list_objectives, methods_with
+from popgen.methods.registry import DEFAULT_EGO, METHODS, find_objective, list_objectives, methods_with
 from popgen.reports.method_titles import name_of, title_of
 from popgen.reports.paper_figures import BASELINES, OWN_METHOD, RENDEZVOUS, SIMULATOR_METHOD
 from popgen.reports.reproduction.target_records import Budget, WantedRun, WantedStudy
-
-EGO = "hipt"
-"""The method of the paper's egos."""
 
 ONE_LEVEL = "fcp"
 """The same networks and training without the ego's second level."""
@@ -131,7 +128,7 @@ def list_conventions(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
 
 def list_study_rows(budget: Budget, seed: int) -> list[WantedRun]:
     """A row for each method whose population teaches egos: clones of people beside those, in all layouts."""
-    words, found = (f"method={EGO}", f"scale={budget.scale}"), []
+    words, found = (f"method={DEFAULT_EGO}", f"scale={budget.scale}"), []
     for name in TEACHERS:
         teachers = (want_runs(budget, [seed], [name], [layout], [SCORES])[0] for layout in budget.layouts)
         found.append([WantedRun(teacher.row, words, seed, (), (teacher,)) for teacher in teachers])
@@ -160,7 +157,7 @@ def list_egos(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     teachers = [*((name,) for name in (*TEACHERS, SIMULATOR)), ALL_TEACHERS]
     found = []
     for seed in seeds:
-        for ego, mark in ((EGO, ""), (ONE_LEVEL, ", one level")):
+        for ego, mark in ((DEFAULT_EGO, ""), (ONE_LEVEL, ", one level")):
             found += train_egos(budget, seeds, seed, teachers, ("holdout",), ALL_TEACHERS, ego, mark)
     return found
 
@@ -172,7 +169,7 @@ def train_egos(
     teachers: Sequence[Sequence[str]],
     measures: tuple[str, ...],
     held_out: Sequence[str] = TEACHERS,
-    ego: str = EGO,
+    ego: str = DEFAULT_EGO,
     mark: str = "",
 ) -> list[WantedRun]:
     """Egos of one seed, beside populations that they never met.

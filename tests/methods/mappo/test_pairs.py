@@ -96,8 +96,8 @@ def test_utilities_are_drawn_by_seed_and_pair() -> None:
     slow = np.array(["MOVEMENT" in name or name == "STAY" or name.startswith("IDLE") for name in names])
     assert 5.0 < np.abs(weights[:, ~slow]).max() <= 10.0 and 0 < np.abs(weights[:, slow]).max() <= 10.0 * STEP_SHARE
     assert draw_utility(names, spread=0.0, biases=3, reward=1.0, seed=(1, 5)).is_true
-    told = drawn[5].describe(names)
-    assert len(told) == 4 and told["reward"] == 1.0
+    described = drawn[5].describe(names)
+    assert len(described) == 4 and described["reward"] == 1.0
 
 
 def test_events_are_counted_while_playing_and_averaged_over_iterations() -> None:

@@ -97,8 +97,8 @@ def test_updates_overlap_with_episodes_where_told(schedule: str, order: list[str
     _, asked = trained(schedule)
     assert [name for name, *_ in asked] == ["begin", *order]
     assert [count for name, count, *_ in asked if name == "learn"] == [2, 2, 1]
-    told = [told for name, *told in asked if name == "ingest"]
-    assert told == [[{1: 0.5}, {1: 1.0}]] * 3  # the shaped return, not the score; no constraint
+    ingested = [arguments for name, *arguments in asked if name == "ingest"]
+    assert ingested == [[{1: 0.5}, {1: 1.0}]] * 3  # the shaped return, not the score; no constraint
 
 
 def test_the_multiplier_of_a_partner_follows_its_score() -> None:

@@ -9,6 +9,7 @@ import torch
 from support.small import AGENT, MODEL, kitchen, random_latent
 from torch import Tensor
 
+from popgen.durable_files import load_state, save_state
 from popgen.losses.policy_losses import lambda_return
 from popgen.methods.xpm_wm.actor_critic import SELF, Actor
 from popgen.methods.xpm_wm.agent import AgentLearner, estimate_returns, rollout_dtype, sample_losses
@@ -16,7 +17,6 @@ from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, Imagined
 from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.world_model import Starts
 from popgen.nets import weights as w
-from popgen.runs.state_files import load_state, save_state
 
 SPEC = kitchen().spec
 ACTIONS = SPEC.num_actions
@@ -121,12 +121,12 @@ def test_good_self_play_actions_gain_and_good_cross_play_actions_lose(
 
 def test_cross_play_moves_the_actor_by_the_lambda_times_the_reinforce_gradient() -> None:
     learner = make_learner(lambda_xp=0.25, entropy=0.0, unimix=0.0, **REINFORCE)
-    scale = float(learner.networks.scale.update(torch.linspace(0.0, 10.0, 101)))
+    scale = float(learner.networks.return_range.update(torch.linspace(0.0, 10.0, 101)))
     assert scale == pytest.approx(9.0)
     imagined = trajectories(ROWS, lambda a: good_and_bad(own_action(a)) + 5.0, seed=3)
     learner.actor.zero_grad()
     sample_losses(
-        learner.networks, learner.cross_play(imagined, 1, SEATS, learner.networks.scale.value()).samples
+        learner.networks, learner.cross_play(imagined, 1, SEATS, learner.networks.return_range.value()).samples
     ).policy.backward()
     got = [parameter.grad.clone() for parameter in learner.actor.parameters()]
     learner.actor.zero_grad()
@@ -163,26 +163,26 @@ def test_the_entropy_scale_falls_to_its_end_once_self_play_has_started(end: floa
     """By the same factor in each update; straight down to an end of zero; never up."""
     learner = make_learner(entropy=1e-2, entropy_end=end, entropy_ramp=20)
     found = []
-    for learner.playing in (0, 0, 10, 20, 99):
+    for learner.updates_since_self_play in (0, 0, 10, 20, 99):
         found.append(learner.entropy_now())
     assert found == pytest.approx(wanted)
 
 
 def test_without_a_ramp_the_entropy_scale_stays() -> None:
     learner = make_learner(entropy=1e-2, entropy_ramp=0)
-    learner.playing = 10_000
+    learner.updates_since_self_play = 10_000
     assert learner.entropy_now() == 1e-2
 
 
 def test_updates_count_for_the_entropy_scale_only_once_self_play_has_started() -> None:
     learner = make_learner(entropy_ramp=4, entropy_end=1e-3)
-    for learner.plays, wanted in ((False, 0), (True, 1), (True, 2)):
+    for learner.self_play_has_begun, wanted in ((False, 0), (True, 1), (True, 2)):
         learner.update()
-        assert learner.playing == wanted
+        assert learner.updates_since_self_play == wanted
     state = learner.state()
     other = make_learner(entropy_ramp=4, entropy_end=1e-3)
     other.load_state(state)
-    assert other.playing == 2 and other.entropy_now() == learner.entropy_now() < learner.config.entropy
+    assert other.updates_since_self_play == 2 and other.entropy_now() == learner.entropy_now() < learner.config.entropy
 
 
 @pytest.mark.parametrize("surrogate", [PPO, REINFORCE], ids=["ppo", "reinforce"])
@@ -239,10 +239,11 @@ def test_slow_critics_follow_and_the_rollout_actor_is_the_actor() -> None:
     assert unchanged(learner.networks.rollout_actor, copies(learner.actor))
 
 
-class Plays:
-    """Instead of an actor: the action is `base + seat`."""
+class Plays(Actor):
+    """An actor without a network: the action is `base + seat`."""
 
     def __init__(self, base: int) -> None:
+        torch.nn.Module.__init__(self)
         self.base = base
 
     def sample(self, latent: Latent, seat: Tensor, generator: Any = None) -> Tensor:
@@ -252,8 +253,8 @@ class Plays:
 
 def test_in_imagined_cross_play_the_partner_sits_in_the_other_seat() -> None:
     learner = make_learner(partners=(1, 2), starts_sp=5, starts_xp=4, horizon=2)
-    learner.networks.rollout_actor = Plays(0)  # type: ignore[assignment]
-    learner.partners[2] = Plays(3)  # type: ignore[assignment]
+    learner.networks.rollout_actor = Plays(0)
+    learner.partners[2] = Plays(3)
     imagined, seats = learner.imagine_play(2)
     assert seats.tolist() == [0, 0, 1, 1]
     for t in range(2):
@@ -386,7 +387,7 @@ def test_restart_forgets_the_agent_and_keeps_model_and_partners() -> None:
     learner.restart(0)
     assert unchanged(learner.model, model) and unchanged(learner.partners[1], partner)
     assert sorted(learner.critics) == ["0", "1", "2"] and learner.updates == 0
-    assert unchanged(learner.actor, copies(twin.actor)) and float(learner.networks.scale.weight) == 0.0
+    assert unchanged(learner.actor, copies(twin.actor)) and float(learner.networks.return_range.weight) == 0.0
     assert unchanged(learner.networks.rollout_actor, copies(twin.actor))
 
 

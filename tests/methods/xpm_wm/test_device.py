@@ -30,7 +30,7 @@ class Loose(AssertionError):
     """A tensor was made wherever torch makes them."""
 
 
-class Told(TorchFunctionMode):
+class DeviceRequired(TorchFunctionMode):
     """Refuses to make a tensor without a device."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -51,9 +51,9 @@ class Array:
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def devices_given(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(torch, "from_numpy", Array)
-    with Told():
+    with DeviceRequired():
         yield
 
 
@@ -76,12 +76,14 @@ def learners() -> tuple[AgentLearner, ModelLearner]:
     return agent(), model
 
 
-def test_the_agent_makes_its_tensors_on_its_device(learners: tuple[AgentLearner, ModelLearner], told: None) -> None:
+def test_the_agent_makes_its_tensors_on_its_device(
+    learners: tuple[AgentLearner, ModelLearner], devices_given: None
+) -> None:
     assert learners[0].update()["partner"] == 1.0
 
 
 def test_the_world_model_makes_its_tensors_on_its_device(
-    learners: tuple[AgentLearner, ModelLearner], told: None
+    learners: tuple[AgentLearner, ModelLearner], devices_given: None
 ) -> None:
     learner, windows = learners[1], random_windows(6, MODEL.length + OPEN_LOOP)
     learner.set_biases(windows)
@@ -90,7 +92,7 @@ def test_the_world_model_makes_its_tensors_on_its_device(
     model_report(learner, windows, context=MODEL.length)
 
 
-def test_a_tensor_made_anywhere_would_be_noticed(told: None) -> None:
+def test_a_tensor_made_anywhere_would_be_noticed(devices_given: None) -> None:
     with pytest.raises(Loose, match="zeros"):
         torch.zeros(3)
     with pytest.raises(AttributeError):

@@ -16,8 +16,8 @@ from popgen.methods.xpm_wm.imagination import (
     LEAST_TRUST,
     Discovery,
     Rates,
-    dearest_events,
     expected_pay,
+    find_highest_paying,
     trusted_shares,
 )
 from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper
@@ -120,7 +120,7 @@ def _make_parts() -> tuple[Any, Any]:
     return view.own, part_weights(view)
 
 
-def test_the_bonus_is_halved_when_the_dearest_event_is_found_and_ends_when_play_begins() -> None:
+def test_the_bonus_is_halved_when_the_highest_paying_event_is_found_and_ends_when_play_begins() -> None:
     discovery = make(count_bonus=1.0, found_events=10)
     assert discovery.bonus_scale(False) == 0.0  # nothing is known of real play
     discovery.tally = tally_of([99, 99, 99, 99, 9])
@@ -130,13 +130,16 @@ def test_the_bonus_is_halved_when_the_dearest_event_is_found_and_ends_when_play_
     assert not make(count_bonus=1.0).found()
 
 
-def test_dearest_are_events_that_pay_half_of_the_dearest() -> None:
+def test_highest_paying_are_events_that_pay_half_of_the_most() -> None:
     spec = replace(SPEC, event_weights=(1.0, 1.0, 3.0, 5.9, 12.0))
-    assert np.flatnonzero(dearest_events(spec)).tolist() == [4]
-    assert np.flatnonzero(dearest_events(replace(spec, event_weights=(1.0, 1.0, 3.0, 6.0, 12.0)))).tolist() == [3, 4]
+    assert np.flatnonzero(find_highest_paying(spec)).tolist() == [4]
+    assert np.flatnonzero(find_highest_paying(replace(spec, event_weights=(1.0, 1.0, 3.0, 6.0, 12.0)))).tolist() == [
+        3,
+        4,
+    ]
 
 
-def test_entropy_falls_when_the_dearest_event_is_found_and_again_when_play_begins() -> None:
+def test_entropy_falls_when_the_highest_paying_event_is_found_and_again_when_play_begins() -> None:
     agent = AGENT.model_copy(update={"entropy": 0.08, "entropy_end": 0.01, "entropy_ramp": 10})
     found = DiscoveryConfig(found_entropy=0.02)
     scales = [entropy_scale(agent, found, *done) for done in ((0, 0), (5, 0), (10, 0), (20, 5), (20, 10), (0, 10))]

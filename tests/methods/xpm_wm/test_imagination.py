@@ -7,10 +7,14 @@ from torch import Tensor
 
 from popgen.methods.xpm_wm.imagination import imagine
 from popgen.methods.xpm_wm.latent_filter import Latent
+from popgen.methods.xpm_wm.world_model import WorldModel
 
 
-class Counter:
+class Counter(WorldModel):
     """A model whose state is a number: h' = 10 h + a^0 + 2 a^1; reward and continuation depend on it alone."""
+
+    def __init__(self) -> None:
+        torch.nn.Module.__init__(self)
 
     def step(self, latent: Latent, actions: Tensor, generator: Any = None) -> Latent:
         return Latent(10 * latent.h + (actions * torch.tensor([1.0, 2.0])).sum(-1, keepdim=True), latent.z)
@@ -30,7 +34,7 @@ def last_digit(latent: Latent) -> Tensor:
 
 def test_rewards_are_those_of_arrival_and_weights_those_of_departure() -> None:
     start = Latent(torch.tensor([[0.0], [3.0]]), torch.zeros(2, 4))
-    imagined = imagine(Counter(), last_digit, start, horizon=3)  # type: ignore[arg-type]
+    imagined = imagine(Counter(), last_digit, start, horizon=3)
     # Row 0: 0 -(0,1)-> 2 -(2,1)-> 24 -(3,1)-> 245.   Row 1: 3 -(3,1)-> 35 -(3,1)-> 355 -(3,1)-> 3555.
     assert imagined.latent.h.squeeze(-1).T.tolist() == [[0, 2, 24, 245], [3, 35, 355, 3555]]
     assert imagined.actions[:, 0].tolist() == [[0, 1], [2, 1], [3, 1]]
@@ -43,5 +47,5 @@ def test_rewards_are_those_of_arrival_and_weights_those_of_departure() -> None:
 
 def test_imagination_carries_no_gradient() -> None:
     start = Latent(torch.ones(2, 1, requires_grad=True), torch.zeros(2, 4))
-    imagined = imagine(Counter(), last_digit, start, horizon=2)  # type: ignore[arg-type]
+    imagined = imagine(Counter(), last_digit, start, horizon=2)
     assert not imagined.reward.requires_grad and not imagined.latent.h.requires_grad

@@ -38,7 +38,7 @@ LATEST, PLAYED = weights(1.0), weights(2.0)
 
 def member() -> FirstMemberProgress:
     """Its window is 16 episodes; no step has been taken yet."""
-    return FirstMemberProgress(16, played=PLAYED, published=LATEST)
+    return FirstMemberProgress(16, playing_weights=PLAYED, published=LATEST)
 
 
 def play(progress: FirstMemberProgress, phase: Phase1Config, *scores: float) -> None:
@@ -114,13 +114,13 @@ def test_without_a_whole_window_the_last_weights_are_all_there_is() -> None:
 def test_self_play_has_started_once_a_whole_window_reached_its_share_of_the_target() -> None:
     first, phase = member(), Phase1Config(target_score=10.0)
     play(first, phase, *[5.0] * 15)
-    assert not first.plays
+    assert not first.self_play_has_begun
     play(first, phase, 4.0)
-    assert not first.plays  # 4.94 of 5
+    assert not first.self_play_has_begun  # 4.94 of 5
     play(first, phase, 6.0)
-    assert first.plays
+    assert first.self_play_has_begun
     play(first, phase, *[0.0] * 16)
-    assert first.plays  # for good
+    assert first.self_play_has_begun  # for good
 
 
 def test_the_last_policy_must_reach_the_target_by_itself() -> None:
@@ -140,7 +140,7 @@ def test_with_a_plateau_a_member_goes_on_past_its_target_until_it_no_longer_gain
     """Windows of 10.0, 10.1 and 10.19 are no gains of 2 % over 10.0; 10.2 is one."""
     first, phase = member(), Phase1Config(target_score=10.0, plateau=3)
     play(first, phase, *[4.0] * 16)
-    assert (first.mark, first.since_gain, first.plays) == (0.0, 0, False)
+    assert (first.mark, first.since_gain, first.self_play_has_begun) == (0.0, 0, False)
     for score, since in ((10.0, 0), (10.1, 1), (10.19, 2), (10.2, 0), (10.2, 1), (10.2, 2)):
         play(first, phase, *[score] * 16)
         assert (first.since_gain, phase1.should_stop(first, phase)) == (since, False)
@@ -159,7 +159,7 @@ def test_a_plateaus_policy_is_measured_by_its_own_best_and_waits_anew_if_it_fail
     phase = Phase1Config(target_score=20.0, plateau=2)
     for score, taken in ((9.7, True), (9.69, False)):
         first = member()
-        first.plays, first.mark, first.since_gain = True, 10.0, 2
+        first.self_play_has_begun, first.mark, first.since_gain = True, 10.0, 2
         episodes = [Episode(Kind.SP, (1, 1), score, score)] * 16
         assert phase1.confirm_policy(first, episodes, phase) == pytest.approx(score)
         assert first.confirmed is taken and not phase1.is_done(first, phase)
@@ -194,7 +194,7 @@ def test_only_a_weak_member_plays_further_rounds() -> None:
     assert phase2.most_rounds(phase, 2, horizon=40) == 4
     for sp, wanted in ((4.9, 4), (5.0, 2)):
         progress = LaterMemberProgress(PartnerStrength("max_window"), best=Candidate(LATEST, sp, 0.0))
-        while phase2.plays_on(progress, phase, 4):
+        while phase2.wants_another_round(progress, phase, 4):
             progress.rounds += 1
         assert progress.rounds == wanted
 
@@ -203,7 +203,7 @@ def test_with_a_plateau_a_later_member_goes_on_while_it_improves() -> None:
     phase = Phase2Config(rounds=2, max_rounds=6, target_score=5.0, plateau=2)
     for last_best, wanted in ((1, 3), (2, 4), (3, 5), (5, 6)):
         progress = LaterMemberProgress(PartnerStrength("max_window"), best=Candidate(LATEST, 5.0, 0.0))
-        while phase2.plays_on(progress, phase, 6):
+        while phase2.wants_another_round(progress, phase, 6):
             progress.rounds += 1
             progress.since_best = max(0, progress.rounds - last_best)
         assert progress.rounds == wanted
@@ -252,11 +252,11 @@ def test_progress_of_member_1_comes_back_from_a_checkpoint() -> None:
     first.recent_starts = Ready(Starts(*(np.ones((1, 2)) for _ in range(4))))
     first.model, first.starts = Ready({"m": np.ones(3)}), Ready(Starts(*(np.zeros((2, 2)) for _ in range(4))))
     again = FirstMemberProgress.from_state(saved(first), 16, 40, InlineTransport().put)
-    assert again.steps == 40 and again.played is None  # set when the first sampler starts
-    counters = ("rounds", "since_best", "confirmations", "restarted", "plays", "mark", "since_gain", "rose_from")
-    for name in (*counters, "recent", "shaped", "figures"):
+    assert again.steps == 40 and again.playing_weights is None  # set when the first sampler starts
+    counters = ("rounds", "since_best", "confirmations", "restarted", "mark", "since_gain", "rose_from")
+    for name in (*counters, "self_play_has_begun", "recent", "shaped", "figures"):
         assert getattr(again, name) == getattr(first, name)
-    assert again.recent.maxlen == 16 and again.plays
+    assert again.recent.maxlen == 16 and again.self_play_has_begun
     assert again.best is not None and first.best is not None and again.best.sp == first.best.sp
     assert np.array_equal(again.best.weights.acting.result()["w"], [2.0, 2.0])
     assert isinstance(again.starts.result(), Starts)  # type: ignore[union-attr]
@@ -265,13 +265,15 @@ def test_progress_of_member_1_comes_back_from_a_checkpoint() -> None:
 
 def test_progress_of_a_later_member_comes_back_from_a_checkpoint() -> None:
     best = Candidate(LATEST, 4.0, 1.0)
-    later = LaterMemberProgress(PartnerStrength("max_window"), rounds=3, plays=True, best=best, since_best=2)
+    later = LaterMemberProgress(
+        PartnerStrength("max_window"), rounds=3, self_play_has_begun=True, best=best, since_best=2
+    )
     later.strength.add(1, [2.0, 4.0])
     later.constraint.multipliers = {1: 0.25}
     again = LaterMemberProgress(PartnerStrength("max_window"), 160)
     again.load_state(saved(later), InlineTransport().put)
     assert again.constraint.multipliers == {1: 0.25}
-    assert (again.rounds, again.plays, again.steps, again.since_best) == (3, True, 160, 2)
+    assert (again.rounds, again.self_play_has_begun, again.steps, again.since_best) == (3, True, 160, 2)
     assert again.strength.scores() == {1: 3.0} and again.best is not None and again.best.merit() == 3.0
 
 

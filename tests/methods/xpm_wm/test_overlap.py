@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from popgen.methods.training import Work
 from popgen.methods.xpm_wm.overlap import AHEAD, Overlap
 
 KINDS = "abc"
@@ -56,7 +57,7 @@ class Rounds:
             for kind, result in overlap.finish():
                 assert result.kind == kind and result.number == overlap.work[kind].tasks + 1
                 self.log.append(("finish", kind))
-                overlap.took_in(kind, seconds=1.0, cpu_seconds=0.5)
+                overlap.record_finished(kind, Work(1, seconds=1.0, cpu_seconds=0.5))
             if overlap.round_ended():
                 self.rounds += 1
                 assert min(overlap.done.values()) >= self.rounds
@@ -130,10 +131,10 @@ def test_staleness_is_what_ended_meanwhile() -> None:
     overlap.start("a", Handle("a", 1, []))
     for number in range(2):
         overlap.start("b", Handle("b", number, []))
-        overlap.took_in("b")
+        overlap.record_finished("b", Work(1))
     overlap.start("c", Handle("c", 1, []))
-    overlap.took_in("a")
-    overlap.took_in("c")
+    overlap.record_finished("a", Work(1))
+    overlap.record_finished("c", Work(1))
     assert overlap.staleness == {"a": 2, "b": 0, "c": 1}
     figures = overlap.figures()
     assert figures["staleness/a"] == 2.0 and figures["queue/b"] == 1.0 and figures["queue/a"] == 0.0

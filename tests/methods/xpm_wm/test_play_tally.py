@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from support.small import kitchen, random_play
 
+from popgen.durable_files import load_state, save_state
 from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper, part_weights
-from popgen.runs.state_files import load_state, save_state
 
 VIEW = kitchen().spec.views["features"]
 

@@ -10,6 +10,7 @@ import torch
 from support.small import MODEL, kitchen, random_windows
 from torch import Tensor
 
+from popgen.durable_files import load_state, save_state
 from popgen.methods.xpm_wm.actor_critic import Actor, fit_actor
 from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
 from popgen.methods.xpm_wm.latent_filter import Latent, from_indices
@@ -24,7 +25,6 @@ from popgen.methods.xpm_wm.world_model import (
     predecessor_kl,
 )
 from popgen.nets import weights as w
-from popgen.runs.state_files import load_state, save_state
 from popgen.types import Kind
 
 SPEC = kitchen().spec
