@@ -117,12 +117,13 @@ def bench_ego(args: argparse.Namespace) -> int:
     """Environment steps a second of an ego's training."""
     bound_threads(1)
     from popgen.config.run_config import RunConfig
-    from popgen.methods.ego.config import EgoRun, FcpRun
+    from popgen.methods.ego.config import EgoFcpRun, EgoRun
+    from popgen.methods.registry import DEFAULT_EGO
 
-    words = [FcpRun.method_override(), "cluster.threads=2", *args.overrides]
+    words = [EgoFcpRun.method_override(), "cluster.threads=2", *args.overrides]
     config = RunConfig.parse(compose(words))
     if not isinstance(config, EgoRun) or config.plays_itself:
-        raise UserError("method", f"{config.method} has no partners", "choose an ego that learns beside a population")
+        raise UserError("method", f"{config.method} has no partners", f"choose another, such as {DEFAULT_EGO}")
     from popgen.pipelines.bench_ego import bench_ego as measure
 
     result = measure(config, seconds=args.seconds, partners=args.partners)

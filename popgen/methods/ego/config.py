@@ -155,10 +155,6 @@ class EgoFcpRun(EgoRun):
     """Name of the method."""
 
 
-FcpRun = EgoFcpRun
-"""The name by which `popgen.cli.bench_commands` still asks for it."""
-
-
 class BrRun(EgoRun):
     """A best response to one partner."""
 
