@@ -392,7 +392,7 @@ def later_member(root: Path, member: int, *overrides: str) -> LaterMember:
     archive: Any = dict.fromkeys(range(1, member))
     progress = LaterMemberProgress(PartnerStrength("max_window"))
     work: Any = None  # nothing is asked of it
-    return LaterMember(Setup(work, config, spec, member, 0, archive, lambda: None), progress)
+    return LaterMember(Setup(work, config, spec, member, 0, archive), progress)
 
 
 def test_every_partner_is_met_in_both_seats(root: Path) -> None:
@@ -418,6 +418,7 @@ def test_the_agent_imagines_before_or_beside_the_world_models_update(root: Path,
         **names,
         update_world_model=answer("update_world_model", model),
         update_agent=answer("update_agent", learned),
+        tally=lambda member: Ready(None),
     )
     loop, figures = later.train(), []
     while len(asked) < 5 or len(figures) < 2:
@@ -438,10 +439,10 @@ def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
     asked: list[ModelTask] = []
     none = np.zeros(0, np.int64)
     tally = Tally(np.array([9, 8, 9, 9, 0]), np.zeros(5, np.int64), 0, none, none, ())
-    work: Any = SimpleNamespace(update_world_model=asked.append)
+    work: Any = SimpleNamespace(update_world_model=asked.append, tally=lambda member: Ready(tally))
     progress = FirstMemberProgress(16, self_play_has_begun=plays)
     spec = make_env(config.env.name, 1).spec
-    FirstMember(Setup(work, config, spec, 1, 0, {}, lambda: tally), progress).update_world_model(7)
+    FirstMember(Setup(work, config, spec, 1, 0, {}), progress).update_world_model(7)
     rows = config.phase1.envs * config.phase1.steps_per_iteration
     assert asked == [ModelTask(7, config.agent.starts_sp, chosen, (1, 4), rows)]
 
@@ -453,7 +454,7 @@ def test_every_look_at_the_last_policy_has_fresh_episodes(root: Path) -> None:
     work: Any = SimpleNamespace(start_episodes=lambda matches, policies, seed, stagger: seeds.append((seed, stagger)))
     weights: Any = SimpleNamespace(acting=None)
     spec = make_env(config.env.name, 1).spec
-    first = FirstMember(Setup(work, config, spec, 1, 3001, {}, lambda: None), FirstMemberProgress(16))
+    first = FirstMember(Setup(work, config, spec, 1, 3001, {}), FirstMemberProgress(16))
     first.progress.published = weights
     first.start_self_play()
     for first.progress.confirmations in (1, 2):

@@ -12,7 +12,7 @@ from popgen.methods.xpm_wm.actor_critic import FIT_ROWS, WorldModelPolicy
 from popgen.methods.xpm_wm.config import WorldModelRun
 from popgen.methods.xpm_wm.phase1 import FirstMemberProgress
 from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
-from popgen.methods.xpm_wm.real_play import Candidate, Tally, goes_by_tally
+from popgen.methods.xpm_wm.real_play import Candidate
 from popgen.methods.xpm_wm.train import FIRST, LEARNERS, FirstMember, LaterMember
 from popgen.methods.xpm_wm.workers import Setup, Workers
 from popgen.nets.weights import same_form
@@ -108,10 +108,7 @@ class XpmWmTraining:
         yield from self._complete(candidate)
 
     def _setup(self) -> Setup:
-        return Setup(self.work, self.config, self.spec, self.member, self.seed, self.archive, self._read_tally)
-
-    def _read_tally(self) -> Tally | None:
-        return self.work.tally(self.member).result() if goes_by_tally(self.config.discovery) else None
+        return Setup(self.work, self.config, self.spec, self.member, self.seed, self.archive)
 
     def _first(self) -> FirstMember:
         assert isinstance(self.progress, FirstMemberProgress)

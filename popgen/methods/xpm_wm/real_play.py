@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -330,6 +330,17 @@ class TallyKeeper:
 def goes_by_tally(config: DiscoveryConfig) -> bool:
     """Whether anything depends on what real play has shown."""
     return bool(config.count_bonus or config.found_events or config.rare_events or config.trust)
+
+
+class HasTally(Protocol):
+    """Workers, or what answers for them."""
+
+    def tally(self, member: int) -> Pending[Tally]: ...
+
+
+def read_tally(work: HasTally, member: int, config: DiscoveryConfig) -> Tally | None:
+    """What real play has shown so far, with `member` as the present one; None where nothing goes by it."""
+    return work.tally(member).result() if goes_by_tally(config) else None
 
 
 def rare_events(tally: Tally | None, config: DiscoveryConfig) -> tuple[int, ...]:

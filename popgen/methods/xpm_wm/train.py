@@ -32,7 +32,7 @@ class FirstMember:
 
     def __init__(self, setup: Setup, progress: phase1.FirstMemberProgress) -> None:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
-        self.phase, self.progress, self.tally = self.config.phase1, progress, setup.tally
+        self.phase, self.progress = self.config.phase1, progress
         self.reports = ModelReports(self.work, self.phase.check_every, waits=self.config.run.schedule == "sync")
 
     def train(self, resumed: bool) -> MemberLoop:
@@ -109,17 +109,17 @@ class FirstMember:
         return self.work.start_sampling(kind, self.phase.steps_per_iteration, FIRST, self.progress.latest.acting)
 
     def update_world_model(self, updates: int) -> Pending[ModelUpdate]:
-        """Lines 6 and 7. Imagination starts from chosen windows only once self-play has begun: before, the model does
-        not know what follows a rare event, and nothing corrects it."""
+        """Lines 6 and 7. Starts from chosen windows once self-play has begun: nothing corrects imagination before."""
         progress, discovery = self.progress, self.config.discovery
         chosen = progress.self_play_has_begun or self.phase.event_starts == "always"
-        rare = real.rare_events(self.tally(), discovery)
+        rare = real.rare_events(real.read_tally(self.work, FIRST, discovery), discovery)
         recent = self.phase.envs * self.phase.steps_per_iteration if discovery.trust else 0
         return self.work.update_world_model(ModelTask(updates, self.config.agent.starts_sp, chosen, rare, recent))
 
     def update_agent(self) -> Pending[AgentUpdate]:
         """Lines 8 and 12 to 15, without partners."""
-        return self.work.update_agent(phase1.make_agent_task(self.progress, self.phase, self.tally()))
+        tally = real.read_tally(self.work, FIRST, self.config.discovery)
+        return self.work.update_agent(phase1.make_agent_task(self.progress, self.phase, tally))
 
     def apply_result(self, kind: str, result: Result) -> Work:
         """Episodes into B_SP, or what a learner published as the newest; the time that the task took."""
@@ -182,7 +182,7 @@ class LaterMember:
     def __init__(self, setup: Setup, progress: phase2.LaterMemberProgress) -> None:
         self.work, self.config, self.spec, self.seed = setup.work, setup.config, setup.spec, setup.seed
         self.member, self.archive = setup.member, setup.archive
-        self.phase, self.progress, self.tally = self.config.phase2, progress, setup.tally
+        self.phase, self.progress = self.config.phase2, progress
         self.episodes_xp = self.phase.cross_play_episodes(len(self.archive))
         self.pairs = real.seatings(self.member, sorted(self.archive)) if self.episodes_xp else []
         self.most_rounds = phase2.most_rounds(self.phase, self.episodes_xp, self.spec.horizon)
@@ -220,7 +220,7 @@ class LaterMember:
     def learn_in_imagination(self, task: AgentTask) -> Generator[Record, bool | None, MemberWeights]:
         """Lines 8 to 15, in pieces for the progress bar: simulation (8, 10), objective (11-13), updates (14, 15)."""
         progress, plan = self.progress, phase2.plan_imagination(self.progress.rounds, self.phase)
-        tally, done = self.tally(), plan.done
+        tally, done = real.read_tally(self.work, self.member, self.config.discovery), plan.done
         while True:
             task = replace(task, updates=min(AGENT_PIECE, plan.done + plan.updates - done), tally=tally)
             update = self.work.update_agent(task).result()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -222,7 +222,6 @@ class Setup:
         config, spec: of the run and its environment.
         member, seed: its number and the seed of everything in it.
         archive: acting weights of the members before it.
-        tally: what real play has shown so far; None where nothing goes by it.
     """
 
     work: Workers
@@ -231,4 +230,3 @@ class Setup:
     member: int
     seed: int
     archive: Mapping[int, Pending[Weights]]
-    tally: Callable[[], Tally | None]
