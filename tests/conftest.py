@@ -24,7 +24,7 @@ for _name, _value in {
     os.environ.setdefault(_name, _value)
 
 ROOT = Path(__file__).resolve().parent.parent
-IN_MEMORY = Path("/dev/shm")  # tests sync and remove thousands of small files: on a disk a fifth of their time
+IN_MEMORY = Path("/dev/shm")  # tests sync and remove thousands of small files, slowly on a disk
 if IN_MEMORY.is_dir() and shutil.disk_usage(IN_MEMORY).free > 4 * 2**30:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(IN_MEMORY))
 WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line

@@ -17,7 +17,7 @@ LAPTOP = Recipe(
     {
         "phase1.prefill_steps": because(
             400_000,
-            "in forced coordination random play delivers two soups by then (docs/notes/learning.md, the same name)",
+            "random play delivers two soups there by then (docs/notes/learning.md, Forced coordination)",
         ),
         "phase1.max_steps": because(1_600_000, "a budget: the plateau ends member 1 before, where it plays"),
         "phase1.target_score": because(10.0, "half of it tells that self-play has begun; the plateau ends the phase"),
