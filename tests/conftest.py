@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 IN_MEMORY = Path("/dev/shm")  # tests sync and remove thousands of small files, slowly on a disk
 if IN_MEMORY.is_dir() and shutil.disk_usage(IN_MEMORY).free > 4 * 2**30:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(IN_MEMORY))
-WITH_RAY = ("test_service.py", "test_two_nodes.py")  # start clusters by the command line
+WITH_CLUSTERS = ("test_service.py", "test_two_nodes.py")  # start clusters of processes and nodes
 
 
 gc.disable()  # until all tests are imported: what they and their libraries are made of is never garbage
@@ -39,17 +39,21 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs Ray."""
+    """Mark what needs Ray. A file is run by one worker of pytest-xdist; both files that start clusters by the same
+    one, since a node that starves beside another cluster counts as dead."""
     for item in items:
         if needs_ray(item):
             item.add_marker(pytest.mark.ray)
+        group = "clusters" if item.path.name in WITH_CLUSTERS else item.path.relative_to(ROOT).as_posix()
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 def needs_ray(item: pytest.Item) -> bool:
     """Whether a test uses a Ray of its module, or stands in a file that imports Ray or starts clusters."""
     assert isinstance(item, pytest.Function)
-    return "cluster" in item.fixturenames or hasattr(item.module, "ray") or item.path.name in WITH_RAY
+    return "cluster" in item.fixturenames or hasattr(item.module, "ray") or item.path.name in WITH_CLUSTERS
 
 
 @pytest.fixture(scope="session", autouse=True)

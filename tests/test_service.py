@@ -59,7 +59,9 @@ def until(what: str, ask: Callable[[], Any], process: subprocess.Popen[Any] | No
     """The first true answer; AssertionError if there is none in time, or if the process has ended."""
     deadline = time.monotonic() + seconds
     while not (answer := ask()):
-        assert process is None or process.poll() is None, f"{what}: the process ended with {process.returncode}"
+        if process is not None and process.poll() is not None:
+            said = process.stdout.read() if process.stdout else ""
+            raise AssertionError(f"{what}: the process ended with {process.returncode}\n{said}")
         assert time.monotonic() < deadline, f"{what}: not within {seconds:g} s"
         time.sleep(0.02)
     return answer

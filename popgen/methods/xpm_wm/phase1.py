@@ -1,6 +1,7 @@
 """Phase 1, member 1: how far its training has come, which is what a checkpoint holds, and the rules that end it.
 
-Rules and what is said of a round are functions of the progress and the recipe; nothing runs for them.
+Rules and what is said of a round are pure functions of the progress and the recipe; what a round changes in the
+progress stands apart. Nothing runs for any of them.
 """
 
 from __future__ import annotations
@@ -218,6 +219,40 @@ def is_confirmed(score: float, wanted: float) -> bool:
     return score >= CONFIRMED * wanted
 
 
+def choose_first(progress: FirstMemberProgress) -> Candidate:
+    """The policy with the best window, unless the last one is about as good."""
+    last, best = Candidate(progress.latest, mean_score(progress), 0.0), progress.best
+    return last if progress.confirmed or best is None or last.sp >= GOOD_ENOUGH * best.sp else best
+
+
+# ---- what a round changes --------------------------------------------------------------------------------------------
+
+
+def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after: float) -> None:
+    """Remember the policy that played, not the one learned meanwhile; rounds count once there is a full window."""
+    if mean_score(progress) < RISING * phase.target_score:
+        progress.rose_from = progress.steps
+    if not has_full_window(progress):
+        return
+    score = mean_score(progress)
+    progress.self_play_has_begun |= score >= entropy_after * phase.target_score
+    count_gain(progress, score, phase)
+    if progress.best is None or score > progress.best.sp:
+        assert progress.playing_weights is not None
+        progress.best, progress.since_best = Candidate(progress.playing_weights, score, 0.0), 0
+    else:
+        progress.since_best += 1
+
+
+def count_gain(progress: FirstMemberProgress, score: float, phase: Phase1Config) -> None:
+    """Of a full window, once self-play has begun."""
+    if not progress.self_play_has_begun:
+        return
+    progress.since_gain += 1
+    if score >= (1.0 + phase.least_gain) * progress.mark:
+        progress.mark, progress.since_gain = score, 0
+
+
 def confirm_policy(progress: FirstMemberProgress, episodes: Sequence[Episode], phase: Phase1Config) -> float:
     """Whole episodes of the last policy alone: its score, and whether that confirms it, which takes the target or, with
     a plateau, the window that last counted as a gain. If not, gains are waited for anew."""
@@ -226,6 +261,9 @@ def confirm_policy(progress: FirstMemberProgress, episodes: Sequence[Episode], p
     progress.confirmed = is_confirmed(score, progress.mark if phase.plateau else phase.target_score)
     progress.since_gain = 0
     return score
+
+
+# ---- what is said ----------------------------------------------------------------------------------------------------
 
 
 def window_figures(progress: FirstMemberProgress, horizon: int) -> dict[str, float]:
@@ -264,34 +302,3 @@ def describe_confirmation(progress: FirstMemberProgress, score: float, episodes:
     """Whole episodes of the last policy in a line."""
     outcome = "taken" if progress.confirmed else "learning continues"
     return f"member 1: {score:.2f} {score_name} in {episodes} episodes of one policy: {outcome}"
-
-
-def keep_best(progress: FirstMemberProgress, phase: Phase1Config, entropy_after: float) -> None:
-    """Remember the policy that played, not the one learned meanwhile; rounds count once there is a full window."""
-    if mean_score(progress) < RISING * phase.target_score:
-        progress.rose_from = progress.steps
-    if not has_full_window(progress):
-        return
-    score = mean_score(progress)
-    progress.self_play_has_begun |= score >= entropy_after * phase.target_score
-    count_gain(progress, score, phase)
-    if progress.best is None or score > progress.best.sp:
-        assert progress.playing_weights is not None
-        progress.best, progress.since_best = Candidate(progress.playing_weights, score, 0.0), 0
-    else:
-        progress.since_best += 1
-
-
-def count_gain(progress: FirstMemberProgress, score: float, phase: Phase1Config) -> None:
-    """Of a full window, once self-play has begun."""
-    if not progress.self_play_has_begun:
-        return
-    progress.since_gain += 1
-    if score >= (1.0 + phase.least_gain) * progress.mark:
-        progress.mark, progress.since_gain = score, 0
-
-
-def choose_first(progress: FirstMemberProgress) -> Candidate:
-    """The policy with the best window, unless the last one is about as good."""
-    last, best = Candidate(progress.latest, mean_score(progress), 0.0), progress.best
-    return last if progress.confirmed or best is None or last.sp >= GOOD_ENOUGH * best.sp else best

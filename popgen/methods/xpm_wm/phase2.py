@@ -1,7 +1,8 @@
 """Phase 2, members 2..M: how far a member's training has come, which is what a checkpoint holds, and the rules of its
 rounds.
 
-Rules and what is said of a round are functions of the progress and the recipe; nothing runs for them.
+Rules and what is said of a round are pure functions of the progress and the recipe; what a round changes in the
+progress stands apart. Nothing runs for any of them.
 """
 
 from __future__ import annotations
@@ -88,6 +89,23 @@ class LaterMemberProgress:
 # ---- rules -----------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class ImaginationPlan:
+    """Agent updates of one round: how many, how many came before, share of starts from the member's own data."""
+
+    updates: int
+    done: int
+    new_share: float
+
+
+def plan_imagination(rounds: int, phase: Phase2Config) -> ImaginationPlan:
+    """Plan the round after `rounds`: the first one has no data of its own, and more updates."""
+    if rounds == 0:
+        return ImaginationPlan(phase.first_updates, 0, 0.0)
+    done = phase.first_updates + (rounds - 1) * phase.updates_per_round
+    return ImaginationPlan(phase.updates_per_round, done, phase.starts_new)
+
+
 def count_imagination(phase: Phase2Config, rounds: int) -> int:
     """Agent updates of so many rounds."""
     return phase.first_updates + (rounds - 1) * phase.updates_per_round if rounds else 0
@@ -105,6 +123,36 @@ def wants_another_round(progress: LaterMemberProgress, phase: Phase2Config, most
     weak = progress.best is None or progress.best.sp < phase.target_score
     goes_on = weak or progress.since_best < phase.plateau
     return progress.rounds < (most if goes_on else min(phase.rounds, most))
+
+
+def foresee_end(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> int | None:
+    """Agent updates after which the member is complete if it is good enough by now; None where it is still weak."""
+    is_open = progress.best is None or progress.best.sp < phase.target_score or phase.plateau > 0
+    return None if is_open else count_imagination(phase, max(progress.rounds, min(phase.rounds, most)))
+
+
+def make_agent_task(
+    progress: LaterMemberProgress,
+    phase: Phase2Config,
+    *,
+    model: Pending[Weights],
+    starts: Pending[Starts],
+    partners: Pending[FittedPartners],
+) -> AgentTask:
+    """The round's task before its first update; the strongest partner so far (line 9) follows from `strength`."""
+    return AgentTask(
+        updates=0,
+        model=model,
+        starts=starts,
+        self_play_has_begun=progress.self_play_has_begun,
+        new_share=plan_imagination(progress.rounds, phase).new_share,
+        partner_scores=progress.strength.scores(),
+        multipliers=progress.constraint.multipliers,
+        partners=partners,
+    )
+
+
+# ---- what a round changes --------------------------------------------------------------------------------------------
 
 
 def judge_round(
@@ -136,11 +184,7 @@ def judge_round(
     return candidate
 
 
-def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name: str) -> str:
-    """A round in a line."""
-    met = f", strongest XP {scored.xp:.2f}" if "real_xp_max" in progress.figures else ""
-    scores = f"SP {scored.sp:.2f}{met} {score_name}"
-    return f"round {progress.rounds}: {scores}, {progress.steps:,} steps"
+# ---- what is said ----------------------------------------------------------------------------------------------------
 
 
 def describe_imagination(progress: LaterMemberProgress, phase: Phase2Config, member: int, most: int) -> Phase:
@@ -157,10 +201,11 @@ def describe_updates(
     return Progress(member, progress.steps, figures, done=done, shown=shown, ends_at=foresee_end(progress, phase, most))
 
 
-def foresee_end(progress: LaterMemberProgress, phase: Phase2Config, most: int) -> int | None:
-    """Agent updates after which the member is complete if it is good enough by now; None where it is still weak."""
-    is_open = progress.best is None or progress.best.sp < phase.target_score or phase.plateau > 0
-    return None if is_open else count_imagination(phase, max(progress.rounds, min(phase.rounds, most)))
+def describe_round(progress: LaterMemberProgress, scored: Candidate, score_name: str) -> str:
+    """A round in a line."""
+    met = f", strongest XP {scored.xp:.2f}" if "real_xp_max" in progress.figures else ""
+    scores = f"SP {scored.sp:.2f}{met} {score_name}"
+    return f"round {progress.rounds}: {scores}, {progress.steps:,} steps"
 
 
 def describe_later_round(
@@ -171,41 +216,3 @@ def describe_later_round(
     note += f"; {trouble}" if trouble else ""
     ended = Round(plan.member, progress.steps, progress.figures, note=note, number=progress.rounds)
     return replace(ended, done=plan.done, ends_at=plan.ends_at)
-
-
-@dataclass(frozen=True)
-class ImaginationPlan:
-    """Agent updates of one round: how many, how many came before, share of starts from the member's own data."""
-
-    updates: int
-    done: int
-    new_share: float
-
-
-def plan_imagination(rounds: int, phase: Phase2Config) -> ImaginationPlan:
-    """Plan the round after `rounds`: the first one has no data of its own, and more updates."""
-    if rounds == 0:
-        return ImaginationPlan(phase.first_updates, 0, 0.0)
-    done = phase.first_updates + (rounds - 1) * phase.updates_per_round
-    return ImaginationPlan(phase.updates_per_round, done, phase.starts_new)
-
-
-def make_agent_task(
-    progress: LaterMemberProgress,
-    phase: Phase2Config,
-    *,
-    model: Pending[Weights],
-    starts: Pending[Starts],
-    partners: Pending[FittedPartners],
-) -> AgentTask:
-    """The round's task before its first update; the strongest partner so far (line 9) follows from `strength`."""
-    return AgentTask(
-        updates=0,
-        model=model,
-        starts=starts,
-        self_play_has_begun=progress.self_play_has_begun,
-        new_share=plan_imagination(progress.rounds, phase).new_share,
-        partner_scores=progress.strength.scores(),
-        multipliers=progress.constraint.multipliers,
-        partners=partners,
-    )

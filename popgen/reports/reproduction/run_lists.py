@@ -142,12 +142,14 @@ def list_study_rows(budget: Budget, seed: int) -> list[WantedRun]:
 
 
 def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
-    """A row for each method that makes populations, in which the egos that they taught stand too."""
+    """A row for each method that makes populations, in which the egos that they taught stand too: of one level, which
+    take a third of the time of two."""
     labels = [name for name, method in METHODS.items() if not method.trains_ego]
     measures = [SCORES, COSTS, "diversity", "acting", "conventions"]
     populations = want_runs(budget, seeds, labels, budget.layouts, measures)
     teachers = [(label,) for label in labels]
-    egos = (train_egos(budget, seeds, seed, teachers, ("holdout", "human")) for seed in seeds)
+    judged = ("holdout", "human")
+    egos = (train_egos(budget, seeds, seed, teachers, judged, ego=ONE_LEVEL) for seed in seeds)
     return [*populations, *(one for found in egos for one in found)]
 
 
