@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from popgen.config.schema import Number, Schema, Weight
+from typing import Annotated
+
+from popgen.config.schema import AddedLater, Number, Schema, Weight
 
 
 class CrossPlayOptions(Schema):
@@ -16,3 +18,11 @@ class CrossPlayOptions(Schema):
     multiplier_step: Weight = 0.5
     """Step of that multiplier, which stays in [0, 1], each time that real scores with the partner arrive: for
     cross-play as good as self-play. Above 1 where scores cannot go far below the limit, as beside 0 dishes."""
+
+
+class PaidCrossPlayOptions(CrossPlayOptions):
+    """The same where cross-play is paid the environment's own reward (XPM-WM's is a sum of events): a floor of it."""
+
+    xp_floor: Annotated[Number | None, AddedLater] = None
+    """Least reward of a step that cross-play counts, in training: doing more harm gains nothing, and a task that is
+    left counts so for each step that it still had; null: rewards as they are."""

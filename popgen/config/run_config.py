@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from popgen.config.schema import Schema
+from popgen.config.schema import AddedLater, Schema
 from popgen.config.sections import (
     ClusterConfig,
     EnvConfig,
@@ -79,12 +79,23 @@ class RunConfig(Schema):
         the run that this one begins from by its id.
         """
         kept = {k: v for k, v in self.as_dict().items() if k not in ("cluster", "tracking", "run")}
+        _drop_later_fields(self, kept)
         if (name := self.env.name).endswith(LAYOUT_FILE):
             kept["env"]["name"] = f"{name.partition('/')[0]}/*{LAYOUT_FILE}"
         if self.population.init_from is not None:
             kept["population"]["init_from"] = os.path.basename(os.path.abspath(self.population.init_from))
         kept["seed"], kept["schedule"] = self.run.seed, self.run.schedule
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def _drop_later_fields(section: BaseModel, values: dict[str, Any]) -> None:
+    """Take fields marked as `AddedLater` that are at their defaults out of what was dumped of a section, in place."""
+    for name, info in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(value, BaseModel) and name in values:
+            _drop_later_fields(value, values[name])
+        elif value == info.default and any(mark is AddedLater for mark in info.metadata):
+            values.pop(name, None)
 
 
 def _mask_values(value: Any) -> Any:

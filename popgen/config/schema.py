@@ -28,6 +28,11 @@ UniformShare = Annotated[_Float, Field(ge=1e-6, le=1.0)]  # mixed into probabili
 Text = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is int else value)]
 
 
+class AddedLater:
+    """Marks a field that earlier versions did not have: at its default it is left out of digests, so that a run which
+    does not use it is the run that it was."""
+
+
 class Schema(BaseModel):
     """Immutable, no unknown keys, no silent conversion of text to numbers.
 

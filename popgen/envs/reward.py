@@ -13,6 +13,18 @@ def rewards_events(spec: EnvSpec) -> bool:
     return any(weight != 0.0 for weight in spec.event_weights)
 
 
+def covered_steps(terminated: np.ndarray, time: np.ndarray, horizon: int) -> np.ndarray:
+    """(...) float32: how many steps a reward stands for. It is one, but where the task ended early: that reward may
+    hold the price of all steps which the episode still had, as in rendezvous.
+
+    Args:
+        terminated: (...) bool, of steps.
+        time: (...) of the state that each led to.
+        horizon: of an episode.
+    """
+    return np.where(terminated, 1 + horizon - time, 1).astype(np.float32)
+
+
 def training_reward(spec: EnvSpec, batch: StepBatch | Segment) -> np.ndarray:
     """Joint reward of steps, counted once for the team, undiscounted and unscaled.
 

@@ -9,8 +9,9 @@ and table of signs of the tree:
 
 A sign is applied to the advantage before any surrogate or clipping; value losses never change sign.
 
-Two further options of every such objective, ours:
+Further options of every such objective, ours:
 
+    a floor       a step of cross-play counts no less than `floor`, an early end so for each step that was left
     a bound       cross-play's advantages count for at most `clip` units of self-play's
     a constraint  maximise J_SP(j) subject to J_XP(j, k) <= limit for every k, by multipliers m_k in [0, 1]: not the
                   strongest partner's J_XP falls, but one that is drawn in proportion to m_k, with lambda_XP max_k m_k
@@ -83,6 +84,14 @@ def signed_advantage(
     if kind is Kind.XP:
         advantage = advantage - advantage.mean()
     return SIGN[kind] * weight * advantage / unit
+
+
+def floor_reward(
+    reward: Float[Tensor, "*steps"], covered: Float[Tensor, "*steps"], floor: float | None
+) -> Float[Tensor, "*steps"]:
+    """Cross-play's rewards, none of them below `floor` for each step that it stands for (`covered_steps`); None: as
+    they are. What costs the team more than holding to another convention does, such as leaving, is then no gain."""
+    return reward if floor is None else torch.maximum(reward, floor * covered)
 
 
 def bound_advantage(

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from functools import cache
 from pathlib import Path
@@ -270,6 +272,17 @@ def test_the_digest_is_of_what_decides_the_result() -> None:
         parsed("population.size=4"),
     ]
     assert len({base.digest(), *(other.digest() for other in others)}) == 5
+
+
+def test_an_option_that_came_later_changes_only_the_digests_of_runs_that_use_it() -> None:
+    base, with_floor = parsed("method=lipo"), parsed("method=lipo", "diversity.xp_floor=-1.0")
+    written = base.as_dict()
+    decides = {name: value for name, value in written.items() if name not in ("cluster", "tracking", "run")}
+    decides |= {"seed": base.run.seed, "schedule": base.run.schedule}
+    del decides["diversity"]["xp_floor"]  # as an earlier version would have it
+    assert base.digest() == hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()
+    assert base.digest() != with_floor.digest()
+    assert RunConfig.parse(written).digest() == base.digest()  # written without it, read with its default
 
 
 def test_a_config_cannot_be_changed() -> None:

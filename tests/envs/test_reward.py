@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from popgen.envs import make_env
-from popgen.envs.reward import rewards_events, training_reward
+from popgen.envs.reward import covered_steps, rewards_events, training_reward
 
 
 def test_overcooked_pays_for_events_of_both_players_once() -> None:
@@ -37,3 +37,8 @@ def test_events_of_another_environment_are_refused() -> None:
     batch = make_env("rendezvous/mppmr", 1).step(np.zeros((1, 2), np.int64))
     with pytest.raises(ValueError, match="expected 5 kinds"):
         training_reward(make_env("overcooked/cramped_room", 1).spec, batch)
+
+
+def test_the_reward_of_an_early_end_stands_for_the_steps_that_were_left() -> None:
+    covered = covered_steps(np.array([False, True, True]), np.array([10, 10, 50]), 50)
+    assert covered.dtype == np.float32 and covered.tolist() == [1.0, 41.0, 1.0]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from popgen.losses.policy_losses import SIGN, ReturnScale, reinforce, signed_advantage
+from popgen.losses.policy_losses import SIGN, ReturnScale, floor_reward, reinforce, signed_advantage
 from popgen.types import Kind
 
 
@@ -73,3 +73,9 @@ def test_signs() -> None:
     torch.testing.assert_close(crossed, torch.tensor([-0.25, 0.0, 0.25]))
     moved = signed_advantage(Kind.XP, advantage + 100, weight=0.25, unit=2.0)
     torch.testing.assert_close(moved, crossed)
+
+
+def test_no_step_of_cross_play_counts_less_than_the_floor() -> None:
+    reward, covered = torch.tensor([-0.5, -2.0, -60.0, -10.0]), torch.tensor([1.0, 1.0, 20.0, 20.0])
+    assert floor_reward(reward, covered, -1.0).tolist() == [-0.5, -1.0, -20.0, -10.0]
+    assert floor_reward(reward, covered, None) is reward

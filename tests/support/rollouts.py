@@ -43,6 +43,7 @@ def rollout(steps: int, *groups: Match, seed: int = 0, **given: Any) -> Rollout:
         "seats": np.broadcast_to(match, (steps, count, 2)).astype(np.int32),
         "episodes": (),
         "events": np.zeros((steps, count, 2, 0), np.uint8),
+        "covered": np.ones((steps, count), np.float32),
     }
     return Rollout(matches=tuple(groups), **(values | given))
 

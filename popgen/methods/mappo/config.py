@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from popgen.config.cross_play_options import CrossPlayOptions
+from popgen.config.cross_play_options import PaidCrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
@@ -81,7 +81,7 @@ class PpoConfig(PpoSection):
         return self
 
 
-class DiversityConfig(CrossPlayOptions):
+class DiversityConfig(PaidCrossPlayOptions):
     """Cross-play and mixed play of LIPO and CoMeDi (paper, equations LIPO and CoMeDi)."""
 
     order: Literal["concurrent", "sequential"] = "concurrent"

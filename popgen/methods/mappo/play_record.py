@@ -92,10 +92,11 @@ class PlayRecord:
         if diversity is None or not partners:
             return own
         weight = linear_schedule(0.0, diversity.lambda_xp, rounds + 1, diversity.warmup)
+        bounds = {"xp_clip": diversity.xp_clip, "xp_floor": diversity.xp_floor}
         if self.job.all_partners:
             first, *others = partners
             each = weight / len(partners)
-            return replace(own, partner=first, others=tuple(others), lambda_xp=each, xp_clip=diversity.xp_clip)
+            return replace(own, partner=first, others=tuple(others), lambda_xp=each, **bounds)
         if diversity.xp_limit is None:
             strength = self.partners[member].scores()
             partner = any_then_strongest(partners, strength, diversity.partner_random, self.rng)
@@ -103,7 +104,7 @@ class PlayRecord:
             constraint = self._move_multipliers(member, rounds)
             partner, weight = constraint.draw_partner(partners, self.rng), weight * constraint.pressure(partners)
         mixed = diversity.lambda_mp if self.job.mixed else 0.0
-        return replace(own, partner=partner, lambda_xp=weight, lambda_mp=mixed, xp_clip=diversity.xp_clip)
+        return replace(own, partner=partner, lambda_xp=weight, lambda_mp=mixed, **bounds)
 
     def _move_multipliers(self, member: int, rounds: int) -> PartnerConstraint:
         """The constraint after the latest scores: of every iteration, or of fresh episodes where these decide."""

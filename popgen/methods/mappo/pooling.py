@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import ViewSpec
-from popgen.losses.policy_losses import bound_advantage, signed_advantage
+from popgen.losses.policy_losses import bound_advantage, floor_reward, signed_advantage
 from popgen.methods.mappo.hidden_utility import Utility
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import critic_name
@@ -39,6 +39,7 @@ class Plan:
     lambda_xp: float = 0.0
     lambda_mp: float = 0.0
     xp_clip: float = 0.0
+    xp_floor: float | None = None
     mate: int | None = None
     others: tuple[int, ...] = ()
 
@@ -60,12 +61,14 @@ class MemberTrajectories:
         trained: (T, n, P) bool, the seat was played by the member's present policy and counts.
         seat: (n,) int64, which seat of cross-play or of a pair the member has; 0 where it has both.
         events: (T, n, F), what the member did in its seats; F = 0 where nobody counted.
+        covered: (T, n), steps that each reward stands for.
     """
 
     steps: Trajectories
     trained: Tensor
     seat: Tensor
     events: Tensor
+    covered: Tensor
 
 
 def gather(rollouts: Sequence[Rollout], kind: Kind, member: int, partner: int) -> MemberTrajectories | None:
@@ -79,8 +82,8 @@ def gather(rollouts: Sequence[Rollout], kind: Kind, member: int, partner: int) -
     if not parts:
         return None
     joined = {name: torch.cat([part[name] for part in parts], _SIDE.get(name, 1)) for name in parts[0]}
-    trained, seat, events = joined.pop("trained"), joined.pop("seat"), joined.pop("events")
-    return MemberTrajectories(Trajectories(**joined), trained, seat, events)
+    beside = {name: joined.pop(name) for name in ("trained", "seat", "events", "covered")}
+    return MemberTrajectories(Trajectories(**joined), **beside)
 
 
 _SIDE = {"cut_at": 0, "cut_obs": 0, "seat": 0}
@@ -107,6 +110,7 @@ def _columns_of_match(rollout: Rollout, index: int, member: int, offset: int) ->
         "cut": rollout.truncated[:, columns],
         "trained": own,
         "events": did,
+        "covered": rollout.covered[:, columns],
         "seat": np.full(match.envs, seat),
     }
     return {name: torch.from_numpy(np.require(array, requirements=["C", "W"])) for name, array in arrays.items()}
@@ -220,6 +224,9 @@ def pool(
         figures = {f"{label}_reward": float(played.steps.reward[counted].mean())}
         if kind is Kind.SP:
             played = _change_reward(played, utility, bonus, figures)
+        elif kind is Kind.XP:
+            floored = floor_reward(played.steps.reward, played.covered, plan.xp_floor)
+            played = replace(played, steps=replace(played.steps, reward=floored))
         critic = critics[name]
         assert isinstance(critic, ValueNet)
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)

@@ -171,9 +171,12 @@ RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}
 
 
 def _objectives(lambda_xp: float) -> dict[str, Settings]:
-    """The paper's objective, and with a bound and a constraint as XPM-Sim has them."""
-    plain = {"diversity.lambda_xp": lambda_xp, "diversity.xp_clip": 0.0, "diversity.xp_limit": None}
-    return {"paper": plain, "ours": {**plain, "diversity.xp_clip": 1.5, "diversity.xp_limit": -45.0}}
+    """The paper's objective, and with a floor, a bound and a constraint as XPM-Sim has them."""
+    names = ("diversity.xp_floor", "diversity.xp_clip", "diversity.xp_limit")
+    rows = {"paper": (None, 0.0, None), "ours": (-0.9, 1.5, -45.0)}
+    return {
+        row: {"diversity.lambda_xp": lambda_xp, **dict(zip(names, values, strict=True))} for row, values in rows.items()
+    }
 
 
 LIPO_RECIPES = _with_diversity(

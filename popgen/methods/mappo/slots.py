@@ -12,7 +12,7 @@ from torch import Tensor
 
 from popgen.envs.contract import BatchedEnv
 from popgen.envs.player_events import count_player_events, name_player_events
-from popgen.envs.reward import training_reward
+from popgen.envs.reward import covered_steps, training_reward
 from popgen.nets.blocks import DrawnActions, draw_by_gumbel
 from popgen.play.episodes import Episode
 from popgen.play.rollout import Match, columns_of, match_of_columns
@@ -34,6 +34,7 @@ class Rollout:
         actions: (T, N, P) uint8.
         log_prob: (T, N, P) float32, of the actions under the policies that took them.
         reward: (T, N) float32, the joint training reward (`popgen.envs.reward`).
+        covered: (T, N) float32, steps that each reward stands for (`popgen.envs.reward.covered_steps`).
         terminated, truncated: (T, N) bool.
         seats: (T, N, P) int32, the member who acted.
         episodes: those that ended, in order.
@@ -47,6 +48,7 @@ class Rollout:
     actions: np.ndarray
     log_prob: np.ndarray
     reward: np.ndarray
+    covered: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
     seats: np.ndarray
@@ -184,7 +186,7 @@ class _SlotRun:
         self.actions = np.empty((steps, count, spec.num_players), np.uint8)
         self.log_prob = np.empty(self.actions.shape, np.float32)
         self.seats = np.empty(self.actions.shape, np.int32)
-        self.rewards = np.empty((steps, count), np.float32)
+        self.rewards, self.covered = (np.empty((steps, count), np.float32) for _ in range(2))
         self.terminated, self.truncated = np.empty((steps, count), bool), np.empty((steps, count), bool)
         kinds = len(name_player_events(self.env)) if pool.events else 0
         self.events = np.zeros((*self.actions.shape, kinds), np.uint8)
@@ -221,6 +223,7 @@ class _SlotRun:
         self.score += result.score
         self.reward += self.rewards[t]
         self.age += 1
+        self.covered[t] = covered_steps(result.terminated, self.age, self.pool.spec.horizon)
         self.obs[t + 1] = self.env.observe(self.pool.view)
         if result.done.any():
             self._end_episodes(t, np.flatnonzero(result.done))
@@ -270,6 +273,7 @@ class _SlotRun:
             actions=self.actions,
             log_prob=self.log_prob,
             reward=self.rewards,
+            covered=self.covered,
             terminated=self.terminated,
             truncated=self.truncated,
             seats=self.seats,

@@ -17,7 +17,14 @@ import torch
 from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv, EnvSpec
-from popgen.losses.policy_losses import bound_advantage, clipped_loss, linear_schedule, reinforce, signed_advantage
+from popgen.losses.policy_losses import (
+    bound_advantage,
+    clipped_loss,
+    floor_reward,
+    linear_schedule,
+    reinforce,
+    signed_advantage,
+)
 from popgen.methods.xpm_sim.advantages import Actions, WeightedActions
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.critics import CriticBatch, Evaluation, MemberCritics
@@ -182,7 +189,8 @@ class XpmSimLearner:
 
     def cross_play(self, batch: SimulatedBatch, partner: int, unit: float) -> PolicyTarget:
         """What the cross-play columns with `partner` teach, in self-play's `unit`."""
-        evaluation = self.evaluator.evaluate_cross_play(batch, partner)
+        floored = replace(batch, reward=floor_reward(batch.reward, batch.covered, self.config.xp_floor))
+        evaluation = self.evaluator.evaluate_cross_play(floored, partner)
         weight = self.lambda_now() * self.constraint.pressure(list(self.partners))
         target = cross_play_target(batch, evaluation, weight=weight, unit=unit, clip=self.config.xp_clip)
         return replace(target, figures=target.figures | {"partner": float(partner)})

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from popgen.config.cross_play_options import CrossPlayOptions
+from popgen.config.cross_play_options import PaidCrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
     Batch,
@@ -26,7 +26,7 @@ _Steps = Annotated[_Int, Field(ge=1, le=100_000)]  # of one simulated trajectory
 _Some = Annotated[_Int, Field(ge=0, le=100_000)]  # of what may be left out
 
 
-class XpmSimConfig(CrossPlayOptions):
+class XpmSimConfig(PaidCrossPlayOptions):
     """Buffers, simulated trajectories and the objective (paper, section 3 and the table of MPPMR agents).
 
     The means over three groups of trajectories enter the objective: self-play from B_SP (`sims_sp`) and from B_XP

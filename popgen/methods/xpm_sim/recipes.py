@@ -33,8 +33,9 @@ LAPTOP = Recipe(
             "xpm_sim.unroll": because(50, "an episode"),
             "xpm_sim.xp_horizon": 50,
             "xpm_sim.restart_horizon": because(3, f"its steps stay at the states of cross-play, {_NOTES}"),
-            "xpm_sim.restart_weight": because(0.5, f"more teaches members to follow each other, {_NOTES}"),
+            "xpm_sim.restart_weight": because(0.25, f"more teaches members to follow each other, {_NOTES}"),
             "xpm_sim.xp_clip": because(1.5, f"leaving is no larger gain than another convention, {_NOTES}"),
+            "xpm_sim.xp_floor": because(-0.9, f"of a step: holding to another landmark costs more, {_NOTES}"),
             "xpm_sim.lambda_xp": because(1.5, f"of all partners drawn in turn, {_NOTES}"),
             "xpm_sim.xp_limit": because(-45.0, f"two members that hold to different landmarks get less, {_NOTES}"),
         },
@@ -114,20 +115,27 @@ PAPER = Recipe(
 )
 
 OBJECTIVES = {
-    "self-play": {"xpm_sim.lambda_xp": 0.0, "xpm_sim.restart_weight": 0.0},
+    "self-play": {"xpm_sim.lambda_xp": 0.0, "xpm_sim.restart_weight": 0.0, "xpm_sim.xp_floor": None},
     "paper": {
         "xpm_sim.lambda_xp": 0.5,
         "xpm_sim.lambda_until": 1.0,
         "xpm_sim.xp_clip": 0.0,
+        "xpm_sim.xp_floor": None,
         "xpm_sim.xp_limit": None,
         "xpm_sim.sp_weight": 0.5,
         "xpm_sim.restart_weight": 0.5,
         "xpm_sim.restart_horizon": 30,
         "xpm_sim.partner_random": 0.0,
     },
-    "ours": {"xpm_sim.lambda_until": 1.0, "xpm_sim.xp_clip": 1.5, "xpm_sim.xp_limit": -45.0},
+    "ours": {
+        "xpm_sim.lambda_until": 1.0,
+        "xpm_sim.xp_clip": 1.5,
+        "xpm_sim.xp_floor": -0.9,
+        "xpm_sim.xp_limit": -45.0,
+    },
 }
 """Self-play alone is the control: independent seeds. `paper` is its objective, with the recipe's networks and budget;
-`ours` bounds cross-play's advantages and makes cross-play a constraint, as in every method with that row."""
+`ours` gives cross-play's rewards a floor, bounds its advantages and makes it a constraint, as in every method with that
+row."""
 
 RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}

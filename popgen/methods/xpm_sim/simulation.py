@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from popgen.envs.reward import training_reward
+from popgen.envs.reward import covered_steps, training_reward
 from popgen.methods.xpm_sim.config import XpmSimConfig
 from popgen.methods.xpm_sim.simulation_starts import StartStates
 from popgen.nets.blocks import DrawnActions, draw_by_gumbel
@@ -78,12 +78,14 @@ class SimulatedBatch(Trajectories):
     Attributes:
         columns: which they are.
         score: (T, N) float32.
+        covered: (T, N) float32, steps that each reward stands for (`popgen.envs.reward.covered_steps`).
         valid: (T, N) bool, the step belongs to a trajectory; False while a column rests after its task terminated.
         count: trajectories that ended or were left at the end.
     """
 
     columns: BatchColumns
     score: Tensor
+    covered: Tensor
     valid: Tensor
     count: int
 
@@ -112,6 +114,7 @@ class Simulator:
         actions = np.empty((time, rows, spec.num_players), np.int64)
         log_prob = torch.empty(time, rows, spec.num_players)
         reward, score = np.empty((time, rows), np.float32), np.empty((time, rows), np.float32)
+        covered = np.ones((time, rows), np.float32)
         terminated, cut = np.zeros((time, rows), bool), np.zeros((time, rows), bool)
         valid, resting = np.ones((time, rows), bool), np.zeros(rows, bool)
         ends: list[np.ndarray] = []
@@ -121,6 +124,7 @@ class Simulator:
             actions[t], log_prob[t] = drawn.action.numpy(), drawn.log_prob
             states, result = self.env.simulate(states, actions[t])
             reward[t], score[t], terminated[t] = training_reward(spec, result), result.score, result.terminated
+            covered[t] = covered_steps(result.terminated, self.env.time(states), spec.horizon)
             age += 1
             valid[t], terminated[t] = ~resting, terminated[t] | resting
             cut[t] = (result.truncated | (age >= limit)) & ~terminated[t]
@@ -144,6 +148,7 @@ class Simulator:
             cut=torch.from_numpy(cut),
             columns=columns,
             score=torch.from_numpy(score),
+            covered=torch.from_numpy(covered),
             valid=torch.from_numpy(valid),
             count=int((terminated & valid).sum() + cut.sum() + ((age > 0) & ~resting).sum()),
         )

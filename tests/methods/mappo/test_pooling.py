@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -121,6 +123,19 @@ def test_cross_play_is_bounded_by_self_plays_spread_where_told() -> None:
     assert bounded.abs().max() < advantage.abs().max()
     pooled = batch(Plan(1, lambda_xp=0.5, xp_clip=0.1))
     torch.testing.assert_close(pooled.advantage[pooled.cross], expected)
+
+
+def test_cross_play_alone_counts_no_less_than_the_floor() -> None:
+    played = [replace(one, covered=np.full_like(one.reward, 2.0)) for one in kinds()]
+    floored = [replace(one, reward=one.reward.copy()) for one in played]
+    for one in floored:  # what follows the four columns of self-play
+        one.reward[:, 4:] = np.maximum(one.reward[:, 4:], -1.0)
+    by_floor, by_hand, as_it_is = (
+        batch(Plan(1, lambda_xp=0.5, xp_floor=floor), rollouts).advantage
+        for floor, rollouts in ((-0.5, played), (None, floored), (None, played))
+    )
+    torch.testing.assert_close(by_floor, by_hand, rtol=0.0, atol=0.0)
+    assert not torch.equal(by_floor, as_it_is)
 
 
 def test_only_the_members_own_seats_are_trained() -> None:

@@ -26,6 +26,7 @@ def batch_of(
         log_prob=-torch.arange(time * count * 2.0).view(time, count, 2),
         reward=rewards,
         score=rewards,
+        covered=torch.ones_like(rewards),
         terminated=torch.tensor(terminated, dtype=torch.bool),
         cut=ends,
         cut_obs=(100.0 + numbers)[ends][:, None, None].expand(-1, 2, 1).clone(),

@@ -86,6 +86,8 @@ def test_leaving_the_bounds_is_terminal_and_not_cut() -> None:
     first = int(batch.terminated[:, 0].nonzero()[0])
     np.testing.assert_allclose(batch.obs[first + 1, 0, 0, 0], 0.3)  # starts again
     assert batch.reward[first, 0] < -4.0
+    assert batch.covered[first, 0] == 50 - first  # itself and those that were left
+    assert batch.covered[~batch.terminated].unique().tolist() == [1.0]
 
 
 def test_cross_play_and_restarts_rest_after_leaving_so_that_each_start_weighs_the_same() -> None:
