@@ -222,11 +222,7 @@ def pool(
             continue
         counted, label = played.trained.any(-1), str(kind).lower()
         figures = {f"{label}_reward": float(played.steps.reward[counted].mean())}
-        if kind is Kind.SP:
-            played = _change_reward(played, utility, bonus, figures)
-        elif kind is Kind.XP:
-            floored = floor_reward(played.steps.reward, played.covered, plan.xp_floor)
-            played = replace(played, steps=replace(played.steps, reward=floored))
+        played = _change_reward(played, kind, plan, utility, bonus, figures)
         critic = critics[name]
         assert isinstance(critic, ValueNet)
         advantage, returns = advantages(played, critic, view, discount=discount, lam=lam)
@@ -265,16 +261,21 @@ def _average_figures(recorded: Sequence[Mapping[str, float]]) -> dict[str, float
 
 def _change_reward(
     played: MemberTrajectories,
+    kind: Kind,
+    plan: Plan,
     utility: Utility | None,
     bonus: Callable[[Trajectories], Tensor] | None,
     figures: dict[str, float],
 ) -> MemberTrajectories:
-    """The same trajectories, paid by a utility and with a bonus, where there are these."""
+    """The same trajectories: self-play paid by a utility and with a bonus, where there are these, cross-play with its
+    floor."""
     reward = played.steps.reward
-    if utility is not None:
+    if kind is Kind.XP:
+        reward = floor_reward(reward, played.covered, plan.xp_floor)
+    if kind is Kind.SP and utility is not None:
         reward = utility.pay(reward, played.events)
         figures["utility"] = float(reward.mean())
-    if bonus is not None:
+    if kind is Kind.SP and bonus is not None:
         extra = bonus(played.steps)
         figures["bonus"] = float(extra.mean())
         reward = reward + extra
