@@ -43,7 +43,7 @@ def _iterate_fields(schema: type[BaseModel], defaults: Mapping[str, Any], prefix
             yield from _iterate_fields(info.annotation, defaults[name], f"{prefix}{name}.")
         else:
             values = range_text(info.annotation, info.metadata)
-            yield FieldDescription(prefix + name, defaults[name], values, info.description or "")
+            yield FieldDescription(prefix + name, defaults[name], values, " ".join((info.description or "").split()))
 
 
 def range_text(annotation: Any, metadata: Sequence[Any] = ()) -> str:
