@@ -278,8 +278,9 @@ class Pieces:
 
 def _describe_run(config: RunConfig) -> list[Any]:
     """What decides a population: rules, method, size and settings."""
-    planned = planned_run(config)
-    return [planned.environment.fingerprint, planned.method, config.population.size, planned.settings]
+    planned, unused = planned_run(config), config.unused_fields()
+    settings = {name: value for name, value in planned.settings.items() if name not in unused}
+    return [planned.environment.fingerprint, planned.method, config.population.size, settings]
 
 
 def keep_last(words: Sequence[str]) -> tuple[str, ...]:

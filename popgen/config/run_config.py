@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
+from functools import reduce
 from importlib import import_module
 from typing import Any
 
@@ -72,6 +73,10 @@ class RunConfig(Schema):
         """JSON-able, without credentials that addresses hold."""
         return _mask_values(self.model_dump(mode="json"))
 
+    def unused_fields(self) -> list[str]:
+        """Dotted names of fields that came later (`AddedLater`) and are at their defaults: they decide nothing."""
+        return list(_find_unused(self))
+
     def digest(self) -> str:
         """sha256 of everything that decides the result (not of where it runs or is tracked).
 
@@ -79,7 +84,9 @@ class RunConfig(Schema):
         the run that this one begins from by its id.
         """
         kept = {k: v for k, v in self.as_dict().items() if k not in ("cluster", "tracking", "run")}
-        _drop_later_fields(self, kept)
+        for name in self.unused_fields():
+            *sections, field = name.split(".")
+            del reduce(lambda values, section: values[section], sections, kept)[field]
         if (name := self.env.name).endswith(LAYOUT_FILE):
             kept["env"]["name"] = f"{name.partition('/')[0]}/*{LAYOUT_FILE}"
         if self.population.init_from is not None:
@@ -88,14 +95,13 @@ class RunConfig(Schema):
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 
-def _drop_later_fields(section: BaseModel, values: dict[str, Any]) -> None:
-    """Take fields marked as `AddedLater` that are at their defaults out of what was dumped of a section, in place."""
+def _find_unused(section: BaseModel, prefix: str = "") -> Iterator[str]:
     for name, info in type(section).model_fields.items():
         value = getattr(section, name)
-        if isinstance(value, BaseModel) and name in values:
-            _drop_later_fields(value, values[name])
+        if isinstance(value, BaseModel):
+            yield from _find_unused(value, f"{prefix}{name}.")
         elif value == info.default and any(mark is AddedLater for mark in info.metadata):
-            values.pop(name, None)
+            yield prefix + name
 
 
 def _mask_values(value: Any) -> Any:

@@ -281,6 +281,7 @@ def test_an_option_that_came_later_changes_only_the_digests_of_runs_that_use_it(
     decides |= {"seed": base.run.seed, "schedule": base.run.schedule}
     del decides["diversity"]["xp_floor"]  # as an earlier version would have it
     assert base.digest() == hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()
+    assert base.unused_fields() == ["diversity.xp_floor"] and not with_floor.unused_fields()
     assert base.digest() != with_floor.digest()
     assert RunConfig.parse(written).digest() == base.digest()  # written without it, read with its default
 

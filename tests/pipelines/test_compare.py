@@ -243,7 +243,7 @@ def test_self_sabotage_of_finished_populations(run: Run, tmp_path: Path) -> None
 
 @pytest.mark.end_to_end
 def test_self_sabotage_trains_every_row_with_equal_options(run: Run, trained: list[RunConfig]) -> None:
-    """Each method with the paper's objective and with ours, which has the same bound and the same limit in all, and
+    """Each method with the paper's objective and with ours, which has the same floor, bound and limit in all, and
     self-play alone as the control."""
     code, out, err = run("experiment", "self-sabotage", "population.size=2", "--episodes", "1", "--json")
     assert code == 0, err

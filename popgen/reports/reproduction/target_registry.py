@@ -96,7 +96,7 @@ TARGETS = {
                 "counts these. Own exit: those in which this agent itself left. An exit costs the worst reward for "
                 "every step that was left. XP apart: of pairs that do not share one of the 4 landmarks.",
                 "Not to leave is no merit of members that play like independent seeds: compare XP with self-play only.",
-                "`paper` is a method's published objective, `ours` the same bound and the same limit of cross-play in "
+                "`paper` is a method's published objective, `ours` the same floor, bound and limit of cross-play in "
                 "every method.",
             ),
         ),
