@@ -14,7 +14,7 @@ Whatever ends the process, the same command goes on with the next piece.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -139,7 +139,8 @@ def make_record(pieces: Pieces, target: Target) -> Record:
             runs.append(told)
         else:
             why = job.failed or "not made yet"
-            missing.append({"row": run.row, "environment": pieces.find_environment(run), "seed": run.seed, "why": why})
+            row, environment = name_missing(run, pieces.wanted[target.name]), pieces.find_environment(run)
+            missing.append({"row": row, "environment": environment, "seed": run.seed, "why": why})
     return {
         "format": FORMAT,
         "format_version": VERSION,
@@ -153,6 +154,12 @@ def make_record(pieces: Pieces, target: Target) -> Record:
         "runs": runs,
         "missing": missing,
     }
+
+
+def name_missing(run: WantedRun, wanted: Sequence[WantedRun]) -> str:
+    """A run by its row; an ego that shares the row of a population is told apart from it."""
+    shared = run.teachers and any(one.row == run.row and not one.teachers for one in wanted)
+    return f"{run.row}'s ego" if shared else run.row
 
 
 def _describe_run(pieces: Pieces, run: WantedRun, job: Job) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from conftest import ROOT
 
 from popgen.errors import UserError
 from popgen.methods.registry import METHODS, list_objectives
+from popgen.pipelines.reproduce import name_missing
 from popgen.reports.charts import reproduction_charts
 from popgen.reports.reproduction.results_page import (
     MOST_BYTES,
@@ -121,6 +122,9 @@ def test_every_generator_has_an_ego_beside_the_same_holdouts_and_people() -> Non
     wanted = ("scores.sp", "scores.xp", "scores.mixed", "scores.obstructed", "diversity.log_determinant")
     wanted += ("diversity.effective_rank", "conventions.nearest", "holdout.average", "human.score")
     assert {*wanted, "costs.real", "costs.minutes"} <= figures
+    assert {name_missing(one, runs) for one in runs if one.row == "LIPO"} == {"LIPO", "LIPO's ego"}
+    alone = TARGETS["ego"].list_runs(BUDGETS["laptop"], [1])
+    assert {name_missing(one, alone) for one in alone} == {one.row for one in alone}
 
 
 def test_an_ego_is_held_against_populations_that_it_never_met() -> None:
@@ -153,7 +157,7 @@ def test_charts_and_reports_of_incomplete_records(name: str, tmp_path: Path) -> 
     one = record(name, [run("XPM-WM", 1, figures, room), run("LIPO", 1, {}, room)], missing=missing)
     reproduction_charts.draw_target(one, TARGETS[name], [tmp_path / "chart.png"])
     assert (tmp_path / "chart.png").stat().st_size > 1000
-    assert "Not run: LIPO in overcooked/cramped_room, seeds 2." in to_report(one)
+    assert "Not run: LIPO in overcooked/cramped_room, seed 2." in to_report(one)
 
 
 def test_a_page_of_records_is_the_same_twice(tmp_path: Path) -> None:

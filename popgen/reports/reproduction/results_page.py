@@ -129,7 +129,10 @@ def _list_missing(record: Record) -> list[str]:
         counts.setdefault((one["row"], one["environment"]), []).append(one["seed"])
     if not counts:
         return []
-    parts = [f"{row} in {name}, seeds {', '.join(map(str, seeds))}" for (row, name), seeds in counts.items()]
+    parts = [
+        f"{row} in {name}, seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+        for (row, name), seeds in counts.items()
+    ]
     return [f"Not run: {'; '.join(parts)}."]
 
 
