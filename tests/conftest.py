@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import support.checked_shapes  # noqa: F401  (before anything of popgen)
+from filelock import FileLock
 from support.stores import keep_tables
 
 for _name, _value in {
@@ -39,21 +40,24 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what needs Ray. A file is run by one worker of pytest-xdist; both files that start clusters by the same
-    one, since a node that starves beside another cluster counts as dead."""
+    """Mark what needs Ray."""
     for item in items:
         if needs_ray(item):
             item.add_marker(pytest.mark.ray)
-        group = "clusters" if item.path.name in WITH_CLUSTERS else item.path.relative_to(ROOT).as_posix()
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 def needs_ray(item: pytest.Item) -> bool:
     """Whether a test uses a Ray of its module, or stands in a file that imports Ray or starts clusters."""
     assert isinstance(item, pytest.Function)
     return "cluster" in item.fixturenames or hasattr(item.module, "ray") or item.path.name in WITH_CLUSTERS
+
+
+@pytest.fixture(scope="module")
+def one_cluster_at_a_time(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """For files that start nodes: one that starves beside another worker's cluster counts as dead."""
+    with FileLock(tmp_path_factory.getbasetemp().parent / "clusters.lock"):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

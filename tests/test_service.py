@@ -139,7 +139,7 @@ def end(process: subprocess.Popen[Any]) -> None:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster(one_cluster_at_a_time: None) -> Iterator[Cluster]:
     folder = Path(tempfile.mkdtemp(prefix="pg-", dir="/tmp"))  # Ray's sockets need a short path
     source = folder / "source"
     for name in PARTS:

@@ -23,12 +23,13 @@ from popgen.progress import NullReporter
 from popgen.runs.ledger import Ledger
 from popgen.runs.recorder import RunRecorder
 
+pytestmark = pytest.mark.timeout(1800)  # it may wait for the other file that starts nodes
 QUICK = {"health_check_initial_delay_ms": 1000, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
 """A dead node is noticed in seconds."""
 
 
 @pytest.fixture(scope="module")
-def nodes() -> Iterator[Cluster]:
+def nodes(one_cluster_at_a_time: None) -> Iterator[Cluster]:
     """A head that has no room for actors, and a node that has."""
     folder = tempfile.mkdtemp(prefix="pg-", dir="/tmp")  # Ray's sockets need a short path
     head = {"num_cpus": 0, "temp_dir": folder, "include_dashboard": False, "_system_config": QUICK}
