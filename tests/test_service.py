@@ -261,6 +261,45 @@ def test_the_entry_script_submits_a_job(cluster: Cluster) -> None:
     assert not (cluster.runs / "refused").exists()
 
 
+def test_a_killed_job_submitted_again_ends_as_one_that_was_not(
+    cluster: Cluster, unbroken: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, tracking = cluster.runs / "killed", "tracking=off"
+    ledger = run / "ledger.jsonl"
+
+    def begin() -> subprocess.Popen[str] | None:
+        """None where the job found its folder half unpacked, which Ray was seen to do: nothing has begun then."""
+        job = cluster.submit("run.id=killed", tracking)
+        try:
+            until("some work", lambda: ledger.exists() and ledger.read_bytes().count(b"\n") > 4, job)
+        except AssertionError as error:
+            if "Cannot find primary config" not in str(error) or run.exists():
+                raise
+            return None
+        return job
+
+    first = begin() or begin()
+    assert first is not None
+    state = json.loads((run / "state.json").read_text())
+    os.kill(state["pid"], signal.SIGSTOP)  # it must not end while we look
+    assert describe_run(run)["state"] == "running"
+    # Another driver on the same run: refused before anything starts or changes.
+    capsys.readouterr()
+    assert cli.main(["run", *JOB, f"run.root={cluster.runs}", "run.id=killed", tracking]) == 2
+    assert f"killed is being run by process {state['pid']} on {socket.gethostname()}" in capsys.readouterr().err
+    os.kill(state["pid"], signal.SIGKILL)
+    out, _ = first.communicate(timeout=240)
+    assert first.returncode == 1, out
+    told = describe_run(run)
+    assert told["state"] == "interrupted" and 0 < told["total_steps"] < STEPS
+    code, out = cluster.run("run.id=killed", tracking)
+    assert code == 0 and "continuing after" in out, out
+    assert entries(run) == entries(unbroken) and sha256s(run) == sha256s(unbroken)
+    told = describe_run(run)
+    assert (told["state"], told["attempt"], told["member"]) == ("finished", 2, 1)
+    assert told["steps"] == describe_run(unbroken)["steps"]
+
+
 def test_a_worker_joins_the_cluster(cluster: Cluster) -> None:
     """A second node on this machine, with ports of its own; it is healthy, and leaves when it is told to."""
 
@@ -303,33 +342,6 @@ def test_a_worker_joins_the_cluster(cluster: Cluster) -> None:
 def test_a_job_without_the_token_is_not_taken(cluster: Cluster) -> None:
     code, out = cluster.run("run.id=stranger", RAY_AUTH_TOKEN=secrets.token_hex(32))
     assert code != 0 and "token" in out and not (cluster.runs / "stranger").exists()
-
-
-def test_a_killed_job_submitted_again_ends_as_one_that_was_not(
-    cluster: Cluster, unbroken: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, tracking = cluster.runs / "killed", "tracking=off"
-    first = cluster.submit("run.id=killed", tracking)
-    ledger = run / "ledger.jsonl"
-    until("some work", lambda: ledger.exists() and ledger.read_bytes().count(b"\n") > 4, first)
-    state = json.loads((run / "state.json").read_text())
-    os.kill(state["pid"], signal.SIGSTOP)  # it must not end while we look
-    assert describe_run(run)["state"] == "running"
-    # Another driver on the same run: refused before anything starts or changes.
-    capsys.readouterr()
-    assert cli.main(["run", *JOB, f"run.root={cluster.runs}", "run.id=killed", tracking]) == 2
-    assert f"killed is being run by process {state['pid']} on {socket.gethostname()}" in capsys.readouterr().err
-    os.kill(state["pid"], signal.SIGKILL)
-    out, _ = first.communicate(timeout=240)
-    assert first.returncode == 1, out
-    told = describe_run(run)
-    assert told["state"] == "interrupted" and 0 < told["total_steps"] < STEPS
-    code, out = cluster.run("run.id=killed", tracking)
-    assert code == 0 and "continuing after" in out, out
-    assert entries(run) == entries(unbroken) and sha256s(run) == sha256s(unbroken)
-    told = describe_run(run)
-    assert (told["state"], told["attempt"], told["member"]) == ("finished", 2, 1)
-    assert told["steps"] == describe_run(unbroken)["steps"]
 
 
 def test_a_run_in_the_jobs_own_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,8 +110,11 @@ def test_mlflows_copy_of_the_population_needs_room(tmp_path: Path, free: Any) ->
         (["cluster.object_store_bytes=9000000000"], "cluster.object_store_bytes"),
     ],
 )
-def test_what_the_memory_cannot_hold_is_refused(overrides: list[str], field: str, tmp_path: Path, memory: Any) -> None:
+def test_what_the_memory_cannot_hold_is_refused(
+    overrides: list[str], field: str, tmp_path: Path, memory: Any, free: Any
+) -> None:
     config = configured(tmp_path, *overrides)
+    free(2**50)
     memory(8 * GIB)
     assert refusal(config).field == field
     memory(2**50)
