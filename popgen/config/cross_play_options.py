@@ -21,7 +21,8 @@ class CrossPlayOptions(Schema):
 
 
 class PaidCrossPlayOptions(CrossPlayOptions):
-    """The same where cross-play is paid the environment's own reward (XPM-WM's is a sum of events): a floor of it."""
+    """The same where the environment or its exact simulation pays for cross-play (XPM-WM imagines its reward): a floor.
+    """
 
     xp_floor: Annotated[Number | None, AddedLater] = None
     """Least reward of a step that cross-play counts, in training: doing more harm gains nothing, and a task that is

@@ -102,8 +102,7 @@ def plan_imagination(rounds: int, phase: Phase2Config) -> ImaginationPlan:
     """Plan the round after `rounds`: the first one has no data of its own, and more updates."""
     if rounds == 0:
         return ImaginationPlan(phase.first_updates, 0, 0.0)
-    done = phase.first_updates + (rounds - 1) * phase.updates_per_round
-    return ImaginationPlan(phase.updates_per_round, done, phase.starts_new)
+    return ImaginationPlan(phase.updates_per_round, count_imagination(phase, rounds), phase.starts_new)
 
 
 def count_imagination(phase: Phase2Config, rounds: int) -> int:
