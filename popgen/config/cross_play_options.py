@@ -21,7 +21,7 @@ class CrossPlayOptions(Schema):
 
 
 class PaidCrossPlayOptions(CrossPlayOptions):
-    """The same where the environment or its exact simulation pays for cross-play (XPM-WM imagines its reward): a floor."""
+    """A floor too, where the environment or its exact simulation pays for cross-play (XPM-WM imagines its reward)."""
 
     xp_floor: Annotated[Number | None, AddedLater] = None
     """Least reward of a step that cross-play counts, in training: doing more harm gains nothing, and a task that is
