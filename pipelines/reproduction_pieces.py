@@ -135,9 +135,10 @@ class Pieces:
         config, words = named(composed.config, self.plan.out / "runs"), composed.words
         planned = planned_run(config)
         for one in self._elsewhere:
-            same = (one.seed, len(one.members)) == (planned.seed, config.population.size)
-            rules = one.environment.fingerprint == planned.environment.fingerprint
-            if same and rules and one.method == planned.method and not differences(planned, one):
+            size = len(one.members)
+            enough = size >= config.population.size if run.of_first else size == config.population.size
+            same = (one.seed, one.environment.fingerprint) == (planned.seed, planned.environment.fingerprint)
+            if same and enough and one.method == planned.method and not differences(planned, one):
                 return Job(run, one.path, config, words, taken_over=True)
         return Job(run, planned.path, config, words)
 

@@ -109,7 +109,6 @@ def measure_curves(job: RunToMeasure) -> dict[str, Any]:
         "first": _average_curve(first, simulated=False),
         "later": _average_curve(later, simulated=False),
         "later_simulated": _average_curve(later, simulated=True),
-        "first_final": table[0][0],
     }
     if later:
         found["final"] = float(np.mean([table[row][row] for row in range(1, len(run.members))]))
@@ -129,6 +128,16 @@ def _average_curve(members: Sequence[MemberRecord], *, simulated: bool) -> list[
     grid = np.linspace(0.0, end, GRID)
     mean = np.mean([np.interp(grid, points[:, 0], points[:, 1]) for points in known], axis=0)
     return [[float(step), float(score)] for step, score in zip(grid, mean, strict=True)]
+
+
+def measure_first(job: RunToMeasure) -> dict[str, Any]:
+    """Of the first member alone: real self-play in training, its score in the run's evaluation, steps and minutes."""
+    run = read_run(job.folder)
+    member = run.members[0]
+    found: dict[str, Any] = {"final": run.scores["matrix"]["mean"][0][0], "steps": member.real}
+    if curve := _average_curve([member], simulated=False):
+        found["curve"] = curve
+    return found | ({} if member.seconds is None else {"minutes": member.seconds / 60})
 
 
 def measure_held(job: RunToMeasure) -> dict[str, Any]:
@@ -261,6 +270,7 @@ MEASURES: dict[str, Callable[[RunToMeasure], dict[str, Any]]] = {
     "scores": measure_scores,
     "costs": measure_costs,
     "curves": measure_curves,
+    "first": measure_first,
     "held": measure_held,
     "sabotage": measure_exits,
     "diversity": measure_diversity,

@@ -477,6 +477,10 @@ def test_a_loop_runs_without_anything_written(root: Path) -> None:
     assert trained.member == 1 and trained.policy.weights() and not (root / "notebook").exists()
 
 
+def test_the_first_member_is_the_same_however_many_follow(whole: Run, root: Path) -> None:
+    assert sha256s(launch(root, "alone", "population.size=1")) == sha256s(whole)[:1]
+
+
 def test_overlapping_work_is_counted_exactly(overlapped: Run) -> None:
     check_ledger(overlapped)
     assert len(overlapped.population) == 1

@@ -165,6 +165,22 @@ def test_finished_runs_of_elsewhere_are_taken_if_they_are_the_same(
     assert len(training.calls) == 8  # of another seed
 
 
+def test_what_is_measured_of_the_first_member_alone_is_taken_from_larger_runs(run: Run, training: Training) -> None:
+    words = ("method=xpm_wm", "scale=smoke", "env=overcooked/cramped_room", "population.size=3", "run.transport=inline")
+    larger = compose([*words, "seed=1", "run.root=three", "run.id=larger", "tracking=off"])
+    training.train(RunConfig.parse(larger), reporter=None)
+    there = ("--budget", "smoke", "--out", "out", "--runs", "three", "--quiet")
+    code, _, err = run("reproduce", "vector-reward", *there)
+    assert code == 0, err
+    assert [call.population.size for call in training.calls] == [3, 1], "the scalar head's run alone is missing"
+    runs = json.loads(Path("out/vector-reward/record.json").read_text())["runs"]
+    assert [(one["row"], one["taken_over"]) for one in runs] == [
+        ("XPM-WM: event vector", True),
+        ("XPM-WM: scalar reward", False),
+    ]
+    assert [one["figures"]["first"]["steps"] for one in runs] == [100, 100]
+
+
 def plan_pieces(*words: str) -> reproduction_pieces.Pieces:
     """What the command would make; nothing is trained."""
     parser = argparse.ArgumentParser()
@@ -308,6 +324,9 @@ def test_measures_of_a_finished_run(tmp_path: Path) -> None:
     costs = measure_costs(job)
     assert (costs["first"], costs["later"], costs["real"], costs["by_members"]) == (1000, 50, 1100, [1000, 1050, 1100])
     assert (costs["first_minutes"], costs["later_minutes"], costs["minutes"]) == (2.0, 1.0, 4.0)
+    first = run_measures.measure_first(job)
+    assert (first["steps"], first["minutes"], first["final"]) == (1000, 2.0, 0.0), "random players serve nothing"
+    assert "curve" not in first
     found = measure_curves(job)
     assert found["later"][10] == [25.0, 5.0] and found["later"][-1] == [50.0, 10.0] and "first" not in found
     scores = measure_scores(job)

@@ -31,7 +31,7 @@ _AXES = {
     "costs.by_members": "real steps",
     "costs.minutes_by_members": "minutes",
     "curves.later": "own steps of a later agent",
-    "curves.first": "steps of agent 1",
+    "first.curve": "steps of agent 1",
     "curves.later_simulated": "simulated steps of a later agent",
 }
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from popgen.methods.registry import DEFAULT_EGO, METHODS, find_objective, list_objectives, methods_with
+from popgen.methods.registry import DEFAULT_EGO, METHODS, find_objective, list_objectives, methods_with, recipe
 from popgen.reports.method_titles import name_of, title_of
 from popgen.reports.paper_figures import BASELINES, OWN_METHOD, RENDEZVOUS, SIMULATOR_METHOD
 from popgen.reports.reproduction.target_records import Budget, WantedRun, WantedStudy
@@ -26,6 +27,12 @@ ALL_TEACHERS = (MODEL, SIMULATOR, *sorted(name_of(title) for title in BASELINES)
 
 NEEDS_RAY = "ppo.max_steps"
 """Methods with this setting learn on RLlib, which runs nowhere else."""
+
+RANDOM_PLAY = 1.2
+"""Dishes that members serve beside a random partner in cramped_room: cross-play need not be less."""
+
+NEVER = 1_000_000.0
+"""A score that nobody reaches."""
 
 KL = "world_model.kl_predecessors"
 SCORES, COSTS = "scores", "costs"
@@ -200,7 +207,24 @@ def train_egos(
 def list_rewards(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     """Agent 1 of XPM-WM with each head of the world model, in the ring alone."""
     variants = {"event vector": {}, "scalar reward": {"world_model.reward_head": "scalar"}}
-    return want_variants(budget, seeds, MODEL, budget.ring, variants, ["curves", COSTS], size=1)
+    runs = want_variants(budget, seeds, MODEL, budget.ring, variants, ["first"], size=1)
+    return [replace(run, of_first=True) for run in runs]
+
+
+def list_baselines(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
+    """Each baseline with other weights of cross-play, and trained for its whole budget."""
+    found = []
+    for environment in budget.layouts:
+        for label in (name_of(title) for title in BASELINES):
+            weight = recipe(label, environment, budget.scale).as_dict()["diversity"]["lambda_xp"]
+            variants = {
+                "recipe": {},
+                "half of lambda_XP": {"diversity.lambda_xp": weight / 2},
+                "twice lambda_XP": {"diversity.lambda_xp": 2 * weight},
+                "no early end": {"ppo.target_score": NEVER},
+            }
+            found += want_variants(budget, seeds, label, environment, variants, [SCORES, COSTS, "held"])
+    return found
 
 
 def list_encoders(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
@@ -217,6 +241,10 @@ def list_ablations(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
         "KL to predecessors": {KL: 1.0},
         "no self-play from cross-play states": {"agent.sp_from_xp": 0.0},
     }
+    limited = {
+        name: {"recipe": {}, "cross-play limited": {f"{part}.xp_limit": RANDOM_PLAY, f"{part}.multiplier_step": 2.0}}
+        for name, part in ((MODEL, "agent"), (SIMULATOR, SIMULATOR))
+    }
     plain = {"env.params.exit_penalty": "none"}
     rendezvous = {
         "recipe": {},
@@ -224,6 +252,7 @@ def list_ablations(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
         "plain termination": plain,
     }
     return [
-        *want_variants(budget, seeds, MODEL, layout, model, [SCORES, COSTS]),
+        *want_variants(budget, seeds, MODEL, layout, model | limited[MODEL], [SCORES, COSTS]),
+        *want_variants(budget, seeds, SIMULATOR, layout, limited[SIMULATOR], [SCORES, COSTS]),
         *want_variants(budget, seeds, f"{SIMULATOR}:ours", RENDEZVOUS, rendezvous, [SCORES, COSTS, "sabotage"]),
     ]

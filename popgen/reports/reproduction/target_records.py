@@ -91,6 +91,7 @@ class WantedRun:
         teachers: runs whose populations an ego is trained with; none for a population.
         holdouts: runs whose populations an ego is held against.
         people: the study in which simulated people play with this row's egos, in all layouts at once.
+        of_first: only its first member is measured, so that a finished run of more members serves as well.
     """
 
     row: str
@@ -100,6 +101,7 @@ class WantedRun:
     teachers: tuple[WantedRun, ...] = ()
     holdouts: tuple[WantedRun, ...] = ()
     people: WantedStudy | None = None
+    of_first: bool = False
 
     @property
     def method(self) -> str:
