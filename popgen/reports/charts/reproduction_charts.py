@@ -53,8 +53,8 @@ def draw_bars(record: Record, target: Target, paths: Sequence[str | Path]) -> No
 
 
 def _draw_bar_panel(axes: Axes, rows: Sequence[TableRow], target: Target, environment: str, title: str) -> None:
-    """Horizontal bars, the first row on top."""
-    lines = [line for line in target.paper(environment) if title in line.cells]
+    """Horizontal bars, the first row on top; the panels of an environment share the names at their left."""
+    lines = [line for line in target.paper(environment) if not set(target.charted).isdisjoint(line.cells)]
     labels = [*(row.label for row in rows), *(f"{line.label} (paper)" for line in lines)]
     for place, row in enumerate(rows):
         cell = row.cells[title]
@@ -62,9 +62,10 @@ def _draw_bar_panel(axes: Axes, rows: Sequence[TableRow], target: Target, enviro
             axes.barh(place, cell.mean, color=COLOURS[0], height=0.7)
             axes.plot([cell.low, cell.high], [place, place], color="black", linewidth=1.0)
     for place, line in enumerate(lines, start=len(rows)):
-        axes.barh(place, line.cells[title], color="none", edgecolor="black", height=0.7, linewidth=0.8)
-    axes.set_yticks(range(len(labels)), labels)
-    axes.invert_yaxis()
+        if title in line.cells:
+            axes.barh(place, line.cells[title], color="none", edgecolor="black", height=0.7, linewidth=0.8)
+    axes.set_yticks(range(len(labels)), labels if title == target.charted[0] else [""] * len(labels))
+    axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_title(f"{environment.partition('/')[2]}: {title}")
     axes.grid(alpha=0.25, linewidth=0.5, axis="x")
 
