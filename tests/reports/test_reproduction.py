@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from conftest import ROOT
+from matplotlib.figure import Figure
 
 from popgen.errors import UserError
 from popgen.methods.registry import METHODS, list_objectives
@@ -158,6 +159,16 @@ def test_charts_and_reports_of_incomplete_records(name: str, tmp_path: Path) -> 
     reproduction_charts.draw_target(one, TARGETS[name], [tmp_path / "chart.png"])
     assert (tmp_path / "chart.png").stat().st_size > 1000
     assert "Not run: LIPO in overcooked/cramped_room, seed 2." in to_report(one)
+
+
+def test_panels_of_an_environment_name_their_rows_once() -> None:
+    """At the left, ours and the paper's."""
+    target = TARGETS["table1"]
+    rows, names = summarise_runs(record("table1", [sabotage(1, 0.0, -30)]), target.columns), []
+    for axes, title in zip(Figure().subplots(1, 2), target.charted, strict=True):
+        reproduction_charts._draw_bar_panel(axes, rows, target, "rendezvous/mppmr", title)
+        names.append([label.get_text() for label in axes.get_yticklabels()])
+    assert names[0] == ["LIPO, paper", "LIPO (paper)", "CoMeDi (paper)", "XPM-Sim (paper)"] and names[1] == [""] * 4
 
 
 def test_a_page_of_records_is_the_same_twice(tmp_path: Path) -> None:
