@@ -100,13 +100,12 @@ def measure_costs(job: RunToMeasure) -> dict[str, Any]:
 
 
 def measure_curves(job: RunToMeasure) -> dict[str, Any]:
-    """Real self-play in training: of the first member, and the mean of the later ones against own and simulated steps;
-    where that is first at SHARE of the later members' score in the run's evaluation."""
+    """Real self-play in training: the mean of later members against own and simulated steps; where that is first at
+    SHARE of the later members' score in the run's evaluation."""
     run = read_run(job.folder)
-    first, later = run.members[:1], run.members[1:]
+    later = run.members[1:]
     table = run.scores["matrix"]["mean"]
     found: dict[str, Any] = {
-        "first": _average_curve(first, simulated=False),
         "later": _average_curve(later, simulated=False),
         "later_simulated": _average_curve(later, simulated=True),
     }

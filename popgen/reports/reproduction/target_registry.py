@@ -66,6 +66,7 @@ _MIXED = (
     Column("mixed play, least", "scores.mixed_least"),
     Column("obstructed pairs", "scores.obstructed", 1),
 )
+_HELD = (Column("agents that pass", "held.passed", 1), Column("steps until all pass", "held.steps", 0))
 _COSTS = (Column("real steps", "costs.real", 0), Column("minutes", "costs.minutes", 1))
 
 TARGETS = {
@@ -111,8 +112,7 @@ TARGETS = {
                 Column("each later", "costs.later", 0),
                 Column(TOTAL, "costs.real", 0),
                 Column("simulated", "costs.simulated", 0),
-                Column("agents that pass", "held.passed", 1),
-                Column("steps until all pass", "held.steps", 0),
+                *_HELD,
             ),
             "draw_members",
             ("costs.by_members",),
@@ -265,8 +265,7 @@ TARGETS = {
                 *_PLAY,
                 *_BESIDE,
                 *_MIXED,
-                Column("agents that pass", "held.passed", 1),
-                Column("steps until all pass", "held.steps", 0),
+                *_HELD,
                 *_COSTS,
             ),
             "draw_bars",
