@@ -14,6 +14,7 @@ from popgen.errors import UserError
 from popgen.evaluation.holdout_players import NO_WEIGHTS
 from popgen.methods.ego.config import BrRun, EgoRun
 from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
+from popgen.methods.ego.ego_rollout import EndedEpisode
 from popgen.methods.ego.partner_source import PartnerSource
 from popgen.methods.ego.train import EgoTraining
 from popgen.methods.ego.workers import Iterations
@@ -144,13 +145,14 @@ class EgoActor:
 
     def iterate(self, count: int) -> Iterations:
         """So many rollouts with their updates."""
-        figures, steps, episodes = UpdateFigures(), 0, []
+        figures, episodes = UpdateFigures(), list[EndedEpisode]()
+        steps = simulated = 0
         for _ in range(count):
-            iteration, played, ended = self.learner.iterate()
-            steps, episodes = steps + played, episodes + ended
-            figures.add(iteration)
+            done = self.learner.iterate()
+            steps, simulated, episodes = steps + done.steps, simulated + done.simulated, episodes + done.episodes
+            figures.add(done.figures)
         means = figures.means() | {"steps_per_second": steps / figures.seconds()}
-        return Iterations(means, steps, episodes, figures.cpu_seconds())
+        return Iterations(means, steps, simulated, episodes, figures.cpu_seconds())
 
     def acting(self) -> Weights:
         """The ego's weights."""

@@ -87,6 +87,8 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
     ledgers = [Ledger(run / "ledger.jsonl") for run in (whole, tmp_path / "killed")]
     assert [ledger.steps(1, kind) for ledger in ledgers] == [640, 640]
     assert ledgers[0].episodes(1, kind) == ledgers[1].episodes(1, kind) > 0
+    moved = [ledger.steps(1, Kind.SIMULATED) for ledger in ledgers]  # augmented starts
+    assert moved[0] == moved[1] and (moved[0] > 0) == (method == "sp_aug")
 
 
 def test_an_ego_says_what_it_was_trained_with_and_plays_as_a_member(

@@ -29,7 +29,7 @@ class AugmentedStarts:
         self._rng = np.random.default_rng(seed)
         spec = env.spec
         self._kept = np.zeros((config.kept, spec.state_size), np.dtype(spec.state_dtype))
-        self._seen = 0
+        self._seen = self._simulated = 0
 
     def see(self, states: np.ndarray) -> None:
         """One state of this step, drawn from the batch (N, S), enters the sample (reservoir sampling)."""
@@ -50,13 +50,20 @@ class AugmentedStarts:
         for step in range(int(steps.max(initial=0))):
             actions = self._rng.integers(env.spec.num_actions, size=(count, env.spec.num_players), dtype=np.uint8)
             following, result = env.simulate(states, actions)
-            goes_on = (step < steps) & ~result.done
+            asked = step < steps
+            self._simulated += int(asked.sum())
+            goes_on = asked & ~result.done
             states = np.where(goes_on[:, None], following, states)
         env.set_state(states, rows[chosen])
         time = env.time(env.get_state())
         time[rows[chosen]] -= time[rows[chosen]] % self._whole
         env.set_time(time)
         return chosen
+
+    def take_simulated(self) -> int:
+        """Simulated steps of the starts since the last call."""
+        taken, self._simulated = self._simulated, 0
+        return taken
 
     def state(self) -> dict[str, Any]:
         """Everything to continue from exactly here."""

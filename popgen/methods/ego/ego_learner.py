@@ -124,10 +124,11 @@ class Targets(NamedTuple):
 
 
 class Iterated(NamedTuple):
-    """What an iteration gave: figures, environment steps and whole episodes."""
+    """What an iteration gave: figures, environment steps, those of moved starts, and whole episodes."""
 
     figures: dict[str, float]
     steps: int
+    simulated: int
     episodes: list[EndedEpisode]
 
 
@@ -179,7 +180,7 @@ class EgoLearner:
         self.net.eval()
         rollout = self.sampler.play()
         figures = self.learn(rollout)
-        return Iterated(figures, rollout.steps, rollout.episodes)
+        return Iterated(figures, rollout.steps, rollout.simulated, rollout.episodes)
 
     # ---- targets -------------------------------------------------------------------------------------------------
 

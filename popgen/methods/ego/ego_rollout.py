@@ -63,7 +63,7 @@ class Rollout:
         cut_at: (K, 2), step and row of each end that was cut, which bootstraps from cut_judged (K, C), cut_who (K, W).
         choices: of the high level, None for one level.
         episodes: whole ones that ended.
-        steps: environment steps, which self-play's rows share.
+        steps: environment steps, which self-play's rows share. simulated: those that moved augmented starts on.
     """
 
     seen: Tensor
@@ -82,6 +82,7 @@ class Rollout:
     choices: Choices | None
     episodes: list[EndedEpisode]
     steps: int
+    simulated: int
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,8 @@ class EgoSampler:
             if done.any():
                 episodes += self._end_episodes(np.flatnonzero(done))
         self._judge(columns, self._observe())
-        return _stack_columns(columns, episodes, self.unroll * self.env.num_envs)
+        simulated = 0 if self.company.starts is None else self.company.starts.take_simulated()
+        return _stack_columns(columns, episodes, self.unroll * self.env.num_envs, simulated)
 
     def _observe(self) -> dict[str, np.ndarray]:
         states = self.env.get_state()
@@ -317,7 +319,7 @@ def _pick_rows(values: np.ndarray, envs: np.ndarray, seats: np.ndarray) -> Tenso
     return torch.from_numpy(values[envs, seats])
 
 
-def _stack_columns(columns: dict[str, list[Any]], episodes: list[EndedEpisode], steps: int) -> Rollout:
+def _stack_columns(columns: dict[str, list[Any]], episodes: list[EndedEpisode], steps: int, simulated: int) -> Rollout:
     choices = None
     if "skill" in columns:
         names = ("skill", "decides", "skill_log_prob", "influence")
@@ -326,4 +328,4 @@ def _stack_columns(columns: dict[str, list[Any]], episodes: list[EndedEpisode], 
     nowhere = {"cut_at": torch.zeros(0, 2, dtype=torch.int64), "cut_judged": judged[:0], "cut_who": who[:0]}
     cuts = {name: torch.cat([empty, *columns.pop(name, [])]) for name, empty in nowhere.items()}
     stacked = {name: torch.stack(column) for name, column in columns.items()}
-    return Rollout(**stacked, **cuts, choices=choices, episodes=episodes, steps=steps)
+    return Rollout(**stacked, **cuts, choices=choices, episodes=episodes, steps=steps, simulated=simulated)

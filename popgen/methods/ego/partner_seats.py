@@ -53,9 +53,11 @@ class PartnerSeats:
             self.cell[rows] = self._rng.choice(self.cells, len(rows), p=self.probabilities())
 
     def probabilities(self) -> np.ndarray:
-        """(2 K,) of the cells; those without a return yet count as the worst."""
-        order = np.argsort(np.argsort(-np.where(np.isnan(self.mean), -np.inf, self.mean), kind="stable"))
-        weights = (order + 1.0) ** (self._priority or 0.0)
+        """(2 K,) of the cells; those without a return yet count as the worst, equal ones share their rank."""
+        badness = -np.where(np.isnan(self.mean), -np.inf, self.mean)
+        _, which, counts = np.unique(badness, return_inverse=True, return_counts=True)
+        ranks = (counts.cumsum() - (counts - 1) / 2)[which]
+        weights = ranks ** (self._priority or 0.0)
         return weights / weights.sum()
 
     def state(self) -> dict[str, Any]:

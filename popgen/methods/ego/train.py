@@ -116,9 +116,10 @@ class EgoTraining:
         now = self.progress
         now.note_episodes(done.episodes, self.names)
         score = float(sum(episode.score for episode in done.episodes))
-        counted = StepCount(
-            self.member, self.kind, f"ego.{self.attempt}", now.rounds, done.steps, len(done.episodes), score
-        )
+        name = f"ego.{self.attempt}"
+        counted = [StepCount(self.member, self.kind, name, now.rounds, done.steps, len(done.episodes), score)]
+        if done.simulated:
+            counted.append(StepCount(self.member, Kind.SIMULATED, name, now.rounds, done.simulated, 0))
         now.rounds, now.steps = now.rounds + 1, now.steps + done.steps
         figures = {f"learner/{name}": value for name, value in done.figures.items()}
         figures |= {f"score/{name}": value for name, value in now.scores.items()}
@@ -131,7 +132,7 @@ class EgoTraining:
             self.member,
             now.steps,
             figures,
-            counted=(counted,),
+            counted=tuple(counted),
             done=min(now.steps, self.config.steps),
             shown=shown,
             number=now.rounds,

@@ -17,12 +17,14 @@ class Iterations:
     Attributes:
         figures: means over them.
         steps: environment steps.
+        simulated: steps of the exact simulator that moved augmented starts on.
         episodes: whole ones that ended.
         cpu_seconds: of the worker.
     """
 
     figures: Figures
     steps: int
+    simulated: int
     episodes: list[EndedEpisode]
     cpu_seconds: float
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -118,6 +119,11 @@ def test_partners_share_the_seats_evenly_or_by_rank() -> None:
     assert ranked.probabilities().tolist() == [0.1, 0.3, 0.2, 0.4]
     ranked.note_returns(np.array([0]), np.array([24.0]))
     assert ranked.mean[0] == 5.0
+    unseen = PartnerSeats(4, 8, 2, 3.0, 0)
+    assert unseen.probabilities().tolist() == [0.125] * 8
+    unseen.note_returns(np.array([0, 1]), np.array([2.0, 2.0]))  # ranks 1.5, 1.5 and six times 5.5
+    unseen._priority = 1.0
+    assert np.allclose(unseen.probabilities(), [1.5 / 36, 1.5 / 36, *[5.5 / 36] * 6])
 
 
 def test_augmented_starts_are_states_of_play_moved_on() -> None:
@@ -130,10 +136,13 @@ def test_augmented_starts_are_states_of_play_moved_on() -> None:
     env.set_time(np.full(8, 13))
     starts.see(env.get_state())
     env.reset()
+    draws = deepcopy(starts._rng)
     assert starts.begin(np.array([1, 6])).all()
     assert (env.time(env.get_state()) == [0, 10, 0, 0, 0, 0, 10, 0]).all() or (
         env.time(env.get_state())[[1, 6]] >= 10
     ).all()
+    draws.random(2), draws.integers(1, size=2)
+    assert starts.take_simulated() == draws.integers(4, size=2).sum() > 0 and starts.take_simulated() == 0
     assert np.array_equal(env.get_state()[0], fresh[0]) and not np.array_equal(moved[1], fresh[1])
 
 
