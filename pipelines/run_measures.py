@@ -22,7 +22,6 @@ from popgen.evaluation.holdout import Casting, evaluate_holdout
 from popgen.evaluation.holdout_players import check_disjoint, open_sides
 from popgen.evaluation.partner_diversity import measure_partners
 from popgen.evaluation.played_games import PlayedGame, count_members, count_people
-from popgen.humans.humans_report import population_folder
 from popgen.humans.proxies import ProxySearch, fit_missing_population
 from popgen.humans.recordings import LAYOUTS, load_games
 from popgen.pipelines.compare import HELD_SEED
@@ -237,8 +236,7 @@ def measure_human(job: RunToMeasure) -> dict[str, Any]:
 
 def find_proxy(job: RunToMeasure, layout: str) -> Path:
     """The population of a layout's proxy of half B; fitted where it is not there yet."""
-    path = population_folder(job.humans, layout, "B")
-    return fit_missing_population(path, layout, "B", seed=SEED, search=ProxySearch(**job.proxy))
+    return fit_missing_population(job.humans, layout, "B", seed=SEED, search=ProxySearch(**job.proxy))
 
 
 def measure_conventions(job: RunToMeasure) -> dict[str, Any]:

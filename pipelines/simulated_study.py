@@ -87,7 +87,7 @@ def _simulate_study(wanted: StudyToSimulate, folder: Path) -> None:
     study = _make_study(wanted, folder)
     size = wanted.size
     layouts = [] if size.random_keys else study.definition.layouts
-    people = [fit_missing_population(wanted.folder / "people" / layout, layout, HALF) for layout in layouts]
+    people = [fit_missing_population(wanted.folder / "people", layout, HALF) for layout in layouts]
     plan = DryRunPlan(participants=size.participants, together=TOGETHER, seed=wanted.seed)
     casting = Casting(study, [load_population(path) for path in people])
     found = run_dry(study, casting, plan, lambda done: None)

@@ -90,6 +90,8 @@ def _report_layout(root: Path, layout: str, games: Sequence[HumanGame]) -> Layou
         population = load_population(folder)
         if population.manifest.method != METHOD:
             raise UserError(str(folder), "is no population of human clones", "give the folder that `fit` wrote")
+        if not len(population):
+            raise UserError(str(folder), "holds no clone: its fit was broken off", "remove it and fit it again")
         extra = population.info(1).extra
         if extra["measures"] != list(MEASURES):
             raise UserError(str(folder), "was fitted by another version of popgen", "fit it again")

@@ -170,7 +170,7 @@ def fit_population(
     games: Sequence[HumanGame] | None = None,
     tell: Callable[[float], None] = lambda share: None,
 ) -> list[Proxy]:
-    """Fit the proxies of one layout and half, and write them as a population.
+    """Fit the proxies of one layout and half, and write them as a population, which is there once it is whole.
 
     Args:
         path: the population's folder, which must not hold one.
@@ -191,9 +191,8 @@ def fit_population(
     training, search, settings = training or CloneTraining(), search or ProxySearch(), CloneSettings()
     games = load_games([HALVES[half]], [layout]) if games is None else games
     provenance = _describe_source(games, half, training, search)
-    digest = hashlib.sha256(json.dumps(provenance, sort_keys=True).encode()).hexdigest()
-    spec = make_human_env(layout).spec
-    writer = PopulationWriter(path, spec, method=METHOD, config_digest=digest, seed=seed)
+    spec, unfinished = make_human_env(layout).spec, _make_unfinished(Path(path))
+    writer = PopulationWriter(unfinished, spec, method=METHOD, config_digest=_digest_facts(provenance), seed=seed)
     proxies = []
     for number in range(members):
         proxy = fit_proxy(games, seed + number, training, search, settings)
@@ -201,18 +200,33 @@ def fit_population(
         writer.add_member(proxy.policy, seed=seed + number, steps={}, extra=extra)
         proxies.append(proxy)
         tell((number + 1) / members)
+    name_folder(unfinished, Path(path))
     return proxies
 
 
+def _make_unfinished(path: Path) -> Path:
+    """An empty folder beside `path`, which is given its name at the end; what was broken off is begun anew.
+
+    Raises:
+        UserError: `path` is taken.
+    """
+    if path.exists() and any(path.iterdir()):
+        raise UserError(str(path), "exists already", "choose another folder, or remove it to fit anew")
+    unfinished = path.with_name(f".{path.name}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return unfinished
+
+
 def fit_missing_population(
-    path: Path, layout: str, half: str, *, seed: int = 0, search: ProxySearch | None = None
+    root: Path, layout: str, half: str, *, seed: int = 0, search: ProxySearch | None = None
 ) -> Path:
-    """The population at `path`, fitted where it is not there; one that was broken off is begun anew."""
+    """The population of this layout, half, seed and search under `root`, fitted where it is not there; its folder's
+    name tells them apart."""
+    games = load_games([HALVES[half]], [layout])
+    facts = _describe_source(games, half, CloneTraining(), search or ProxySearch())
+    path = root / f"{layout}_{half}-s{seed}-{_digest_facts(facts)[:8]}"
     if not path.is_dir():
-        unfinished = path.with_name(f".{path.name}")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        fit_population(unfinished, layout, half, seed=seed, search=search)
-        name_folder(unfinished, path)
+        fit_population(path, layout, half, seed=seed, search=search, games=games)
     return path
 
 
@@ -230,6 +244,10 @@ def _describe_source(
         "training": asdict(training),
         "search": asdict(search),
     }
+
+
+def _digest_facts(facts: dict[str, object]) -> str:
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
 def _describe_figures(proxy: Proxy) -> dict[str, object]:

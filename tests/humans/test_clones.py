@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from popgen.humans.behaviour import MEASURES, Rates, compare_rates, measure_poli
 from popgen.humans.clone_inputs import PER_TARGET, TARGETS, NearestTargets
 from popgen.humans.clone_policy import ClonePolicy, CloneSettings
 from popgen.humans.cloning import CloneTraining, change_settings, fit_clone, negative_log_likelihood
-from popgen.humans.proxies import ProxySearch, fit_population
+from popgen.humans.proxies import ProxySearch, fit_missing_population, fit_population
 from popgen.humans.recordings import HumanGame, load_games, make_human_env
 from popgen.play.policy import Policy, Remembering
 from popgen.population import load_population
@@ -157,5 +159,30 @@ def test_fit_and_show(
     code, out, _ = run("humans", "show", "--json")
     assert len(json.loads(out)["layouts"]) == 5
     code, _, err = run("humans", "fit", "--layout", "cramped_room", "--half", "A", "--quiet")
-    assert code == 2 and "holds a population already" in err
+    assert code == 2 and "exists already" in err
     assert run("humans", "fit", "--layout", "nowhere")[0] == 2
+
+
+def test_a_fit_that_was_broken_off_leaves_nothing_to_trip_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, games: list[HumanGame]
+) -> None:
+    def break_off(*given: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    wanted: dict[str, Any] = {"training": QUICK, "search": SHORT, "games": games}
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr("popgen.humans.proxies.fit_proxy", break_off)
+        fit_population(tmp_path / "people", games[0].layout, "A", **wanted)
+    assert not (tmp_path / "people").exists()
+    fit_population(tmp_path / "people", games[0].layout, "A", **wanted)
+    assert [path.name for path in tmp_path.iterdir()] == ["people"] and len(load_population(tmp_path / "people")) == 1
+
+
+def test_a_proxy_of_another_search_is_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("popgen.humans.proxies.CloneTraining", lambda: QUICK)
+    first = fit_missing_population(tmp_path, "cramped_room", "B", search=SHORT)
+    written = (first / "manifest.json").stat().st_mtime_ns
+    other = fit_missing_population(tmp_path, "cramped_room", "B", search=replace(SHORT, episodes=SHORT.episodes + 1))
+    assert fit_missing_population(tmp_path, "cramped_room", "B", search=SHORT) == first != other
+    assert (first / "manifest.json").stat().st_mtime_ns == written
+    assert fit_missing_population(tmp_path, "cramped_room", "B", seed=1, search=SHORT) not in (first, other)
