@@ -33,7 +33,17 @@ from popgen.methods.xpm_wm.imagination import OLD
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.model_report import OPEN_LOOP, model_report
 from popgen.methods.xpm_wm.real_play import MemberWeights, Tally
-from popgen.methods.xpm_wm.replay import Draws, Query, ReplayActor, Request, Windows, join, model_batch, start_batch
+from popgen.methods.xpm_wm.replay import (
+    Draws,
+    Query,
+    ReplayActor,
+    Request,
+    Windows,
+    exchange_players,
+    join,
+    model_batch,
+    start_batch,
+)
 from popgen.methods.xpm_wm.skilled_training import FcpWmTraining
 from popgen.methods.xpm_wm.workers import AgentTask, AgentUpdate, FittedPartners, ModelTask, ModelUpdate
 from popgen.methods.xpm_wm.world_model import ModelLearner, Starts, fit_partners
@@ -154,11 +164,16 @@ class WorldModelActor:
         return FittedPartners({member: weights_of(actor) for member, actor in actors.items()}, figures)
 
     def report(self) -> dict[str, float]:
-        """Event precision and recall at one step and open loop, exact observations: on fresh windows."""
+        """Event precision and recall at one step and open loop, exact observations: on fresh windows, and on the same
+        with the players exchanged (`exchanged/NAME`), of which the model may know nothing."""
         length = self.config.world_model.length
         parts = self._draw_windows(model_batch(self.config, self.member), length + OPEN_LOOP, 4)
         windows = join([part for update in parts for part in update if part is not None])
-        return model_report(self.learner, windows, context=length)
+        figures, generator = model_report(self.learner, windows, context=length), self.learner.generator
+        before = generator.get_state()
+        other = model_report(self.learner, exchange_players(windows), context=length)
+        generator.set_state(before)  # what is only looked at changes no training
+        return figures | {f"exchanged/{name}": value for name, value in other.items()}
 
     def weights(self) -> Pending[Weights]:
         """The whole world model, in the store."""

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from popgen.methods.recipe import Recipe, Settings, because, ours
 
 _CHANCE = "chance must find the first soups, and better ways later (docs/notes/learning.md, More chance)"
+_FORCED = "docs/notes/learning.md, Later members in forced_coordination"
+_CRAMPED = f"its populations of eight were trained so ({_FORCED})"
 _FALSE_DELIVERIES = "imagined deliveries must not outnumber real ones (docs/notes/learning.md, The counter circuit)"
 _DREAMER = "DreamerV3's (Hafner et al. 2025), which the paper builds on; its table has none"
 _NEVER = "never reached: the table's steps are what is run"
@@ -30,7 +32,11 @@ LAPTOP = Recipe(
         "phase2.partner_fits": because(
             100, "partners are themselves on the latents (docs/notes/learning.md, What holds later members back)"
         ),
-        "phase2.max_rounds": because(16, "a member that is still weak after eight rounds gets some more"),
+        "phase2.first_updates": because(200, "self-play begins a round or two sooner"),
+        "phase2.starts_new": because(0.8, "it plays better, and more slowly: more of its own states"),
+        "phase2.discount": because(0.97, f"with 0.99 its values run away ({_FORCED})"),
+        "phase2.rounds": because(14, "they are at two thirds of their dishes after eight rounds, at all after twelve"),
+        "phase2.max_rounds": because(16, "a member that is still weak by then gets some more"),
         "phase2.plateau": because(2, "so does one that still improves"),
         "phase2.model_lag": because(1, "the second core works (docs/notes/learning.md, A model that lags)"),
     },
@@ -39,14 +45,17 @@ LAPTOP = Recipe(
             "phase1.prefill_steps": because(256_000, "random play finds soups here"),
             "phase1.max_steps": 680_000,
             "phase1.target_score": 10.5,
+            "phase2.first_updates": because(100, _CRAMPED),
+            "phase2.starts_new": because(0.5, _CRAMPED),
+            "phase2.discount": because(None, _CRAMPED),
+            "phase2.rounds": because(8, "members are at 10 dishes by then"),
             "phase2.max_rounds": 9,
         },
         "overcooked/coordination_ring": {
-            "phase2.first_updates": because(200, "self-play begins a round or two sooner"),
-            "phase2.starts_new": because(0.8, "it plays better, and more slowly: more of its own states"),
-            "phase2.discount": because(0.97, "with 0.99 its values run away, and scores swing between rounds"),
-            "phase2.rounds": because(14, "it is at 8 dishes after eight and at 11 to 12 after twelve"),
             "phase2.model_lag": because(0, "measured so (docs/notes/learning.md, What holds later members back)"),
+        },
+        "overcooked/forced_coordination": {
+            "phase2.model_lag": because(0, f"measured so ({_FORCED})"),
         },
         "overcooked/counter_circuit_o_1order": {
             "world_model.batch": because(32, "more and smaller updates know the kitchen sooner"),
@@ -54,6 +63,7 @@ LAPTOP = Recipe(
             "agent.advantage_clip": because(5.0, "the first deliveries would inflate the unit of all advantages"),
             "agent.entropy": because(0.08, "at less, roles settle before soups are carried to the counter"),
             "agent.entropy_end": 0.02,
+            "phase2.entropy": because(None, "as member 1's, for the same reason; not measured"),
             "replay.event_fraction": because(0.25, "few windows repeated often are believed"),
             "phase1.pretrain_updates": 3000,
             "phase1.steps_per_iteration": 200,

@@ -7,7 +7,7 @@ No torch here: the actors that hold the buffers would load it for nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,13 @@ class Windows:
     partner: np.ndarray
     kind: np.ndarray
     chosen: np.ndarray
+
+
+def exchange_players(windows: Windows) -> Windows:
+    """The windows with their players exchanged: true ones too, but for who goes first where both interact with one
+    thing in the same step, and where a player cannot reach the other's places."""
+    obs, actions, events = (array[:, :, ::-1].copy() for array in (windows.obs, windows.actions, windows.events))
+    return replace(windows, obs=obs, actions=actions, events=events)
 
 
 @dataclass(frozen=True)

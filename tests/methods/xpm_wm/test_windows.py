@@ -6,7 +6,7 @@ import pytest
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
 from popgen.methods.xpm_wm.imagination import NEW_SP, NEW_XP, OLD, draw_cross_play, draw_self_play
-from popgen.methods.xpm_wm.replay import Draws, major_events, model_batch, start_batch
+from popgen.methods.xpm_wm.replay import Draws, Windows, exchange_players, major_events, model_batch, start_batch
 from popgen.methods.xpm_wm.world_model import Starts
 from popgen.types import Kind
 
@@ -107,3 +107,28 @@ def test_starts_are_joined_in_order() -> None:
     joined = Starts.concat(parts)
     assert joined.pool.tolist() == [OLD, OLD, NEW_SP, NEW_XP, NEW_XP] and joined.partner.tolist() == [0, 0, 0, 4, 4]
     assert len(joined) == 5 and joined.h.shape == (5, 2)
+
+
+GRID = "XXXPXXX/O {}   D/X  X  X/O   {} S/XXXXXXX"
+
+
+def test_a_window_with_exchanged_players_is_the_play_of_exchanged_players() -> None:
+    """The oracle: the same kitchen with both players' places exchanged, in which each takes the other's actions."""
+    steps, rng = 60, np.random.default_rng(0)
+    first, second = (make_env("overcooked/alcove", 4, grid=GRID.format(*order)) for order in ("12", "21"))
+    seen: dict[str, list[np.ndarray]] = {"as": [], "exchanged": [], "events": [], "exchanged events": []}
+    actions = rng.integers(first.spec.num_actions, size=(steps, 4, 2), dtype=np.uint8)
+    for joint in actions:
+        results = first.step(joint), second.step(joint[:, ::-1])
+        for name, env, result in zip(("as", "exchanged"), (first, second), results, strict=True):
+            seen[name].append(env.encode(env.get_state(), "features"))
+            seen[f"{'' if name == 'as' else 'exchanged '}events"].append(result.events)
+    stacked = {name: np.stack(values, 1) for name, values in seen.items()}
+    none, zeros = np.zeros((4, steps), bool), np.zeros(4, np.int64)
+    taken = actions.transpose(1, 0, 2).astype(np.int64)
+    windows = Windows(stacked["as"], taken, stacked["events"], none, none, zeros, zeros, zeros.astype(bool))
+    exchanged = exchange_players(windows)
+    assert np.array_equal(exchanged.obs, stacked["exchanged"])
+    assert np.array_equal(exchanged.events, stacked["exchanged events"]) and windows.events.any()
+    assert np.array_equal(exchanged.actions, taken[:, :, ::-1])
+    assert np.array_equal(windows.obs, stacked["as"])  # what was given is unchanged
