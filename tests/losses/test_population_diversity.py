@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from popgen.losses.population_diversity import population_surprise, trajectory_divergence
+from popgen.losses.population_diversity import divergence_rewards, population_surprise, trajectory_divergence
 
 MEMBERS, STEPS, ACTIONS = 3, 10, 4
 
@@ -82,3 +84,75 @@ def test_mean_divergence_of_single_actions_is_that_of_jensen_and_shannon() -> No
     mean = probabilities[:, 0].mean(0)
     entropy = lambda p: -(p * np.log(p)).sum(-1)  # noqa: E731
     assert total / MEMBERS == pytest.approx(entropy(mean) - entropy(probabilities[:, 0]).mean(), abs=1e-9)
+
+
+def test_rewards_of_divergence_by_hand() -> None:
+    """Two steps, whole episodes compared: the member's 1/2 beside 1/4, then 4/5 beside 1/5. The first step is worth
+    ln 4/3; the second makes both steps' parts ln 16/9, and is paid what is new."""
+    log_probs = torch.tensor([[0.5, 0.8], [0.25, 0.2]], dtype=torch.float64).log()[:, :, None]
+    ends = torch.tensor([[False], [True]])
+    found = divergence_rewards(log_probs, 0, ends, 1.0)[:, 0]
+    first, both = math.log(4 / 3), math.log(16 / 9)
+    assert found.tolist() == pytest.approx([first, 2 * both - first])
+
+
+@pytest.mark.parametrize("kernel", [0.0, 0.5, 1.0])
+def test_rewards_add_up_to_the_divergence_of_an_episode_and_look_at_no_later_action(kernel: float) -> None:
+    """Two games side by side, of which one has two episodes; with kernel 0 the rewards are the parts themselves."""
+    rng = np.random.default_rng(5)
+    log_probs = torch.cat([played(policies(), rng.integers(0, ACTIONS, STEPS)) for _ in range(2)], -1)
+    ends = torch.zeros(STEPS, 2, dtype=torch.bool)
+    ends[3, 0] = ends[-1] = True
+    parts, rewards = (function(log_probs, 1, ends, kernel) for function in (trajectory_divergence, divergence_rewards))
+    for game, episode in ((0, slice(0, 4)), (0, slice(4, STEPS)), (1, slice(0, STEPS))):
+        assert float(rewards[episode, game].sum()) == pytest.approx(float(parts[episode, game].sum()), abs=1e-9)
+    if kernel == 0.0:
+        torch.testing.assert_close(rewards, parts)
+    changed = log_probs.clone()
+    changed[:, 6:] = log_probs[:, 6:].roll(1, 0)
+    again = divergence_rewards(changed, 1, ends, kernel)
+    torch.testing.assert_close(again[:6], rewards[:6])
+    assert not torch.allclose(again[6:], rewards[6:])
+
+
+def enumerate_games(members: int, steps: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Logits (K, T, last action, A) of random members with two actions, and the log-probabilities (K, T, games) that
+    they give every game there is."""
+    logits = torch.randn(members, steps, 3, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    logits.requires_grad_()
+    actions = torch.tensor(list(itertools.product(range(2), repeat=steps)))
+    before = torch.cat([torch.full((len(actions), 1), 2), actions[:, :-1]], 1)
+    log_probs = torch.log_softmax(logits, -1)[:, torch.arange(steps), before, actions]
+    return logits, log_probs.transpose(1, 2)
+
+
+def gradients(members: int, kernel: float, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the divergence by member 0's logits: the whole, its score-function part, and what policy gradients with the
+    rewards' undiscounted returns learn."""
+    logits, log_probs = enumerate_games(members, 4, seed)
+    ends = torch.zeros(log_probs.shape[1:], dtype=torch.bool)
+    ends[-1] = True
+    chances, known = log_probs.sum(1).exp(), log_probs.detach()
+    returns = divergence_rewards(known, 0, ends, kernel).flip(0).cumsum(0).flip(0)
+    worth = torch.stack([chances[k] * trajectory_divergence(log_probs, k, ends, kernel) for k in range(members)]).sum()
+    score = (chances[0] * trajectory_divergence(known, 0, ends, kernel)).sum()
+    learned = (chances[0].detach() * log_probs[0] * returns).sum()
+    found = [torch.autograd.grad(one, logits, retain_graph=True)[0][0] for one in (worth, score, learned)]
+    return found[0], found[1], found[2]
+
+
+@pytest.mark.parametrize("members", [2, 3])
+@pytest.mark.parametrize("kernel", [0.0, 0.3, 0.5, 1.0])
+def test_returns_of_the_rewards_are_the_divergences_score_function_gradient(members: int, kernel: float) -> None:
+    """Brute force over all games of four steps, of members who heed the last action."""
+    for seed in range(3):
+        _, score, learned = gradients(members, kernel, seed)
+        torch.testing.assert_close(learned, score, atol=1e-12, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("kernel", "share"), [(0.0, 0.975), (0.5, 0.77), (1.0, 1.0)])
+def test_what_the_score_function_has_of_the_whole_gradient(kernel: float, share: float) -> None:
+    """Along the whole one, over twenty random populations: what `popgen.methods.mappo.trajedi` says is left out."""
+    found = [gradients(members, kernel, seed) for members in (2, 3) for seed in range(10)]
+    kept = sum(float((learned * whole).sum()) for whole, _, learned in found)
+    assert kept / sum(float(whole.square().sum()) for whole, *_ in found) == pytest.approx(share, abs=0.005)

@@ -38,6 +38,7 @@ def rollout(steps: int, *groups: Match, seed: int = 0, **given: Any) -> Rollout:
         "actions": rng.integers(0, 3, (steps, count, 2)).astype(np.uint8),
         "log_prob": rng.normal(size=(steps, count, 2)).astype(np.float32) - 2,
         "reward": rng.normal(size=(steps, count)).astype(np.float32),
+        "score": np.zeros((steps, count), np.float32),
         "terminated": np.zeros((steps, count), bool),
         "truncated": np.zeros((steps, count), bool),
         "seats": np.broadcast_to(match, (steps, count, 2)).astype(np.int32),

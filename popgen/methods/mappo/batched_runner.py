@@ -103,7 +103,7 @@ class BatchedRunner(EnvRunner):
             if member in weights:
                 load_weights(actor, weights[member])
             actors[member] = actor
-            if self.job.mate_of(member) == -member:
+            if self.job.is_noisy(member):
                 actors[-member] = mix_with_random(actor, self.job.noise)
         return actors
 

@@ -154,7 +154,7 @@ class TrajediConfig(Schema):
     """The trajectory divergence of TrajeDi (Lupu et al. 2021)."""
 
     alpha: Weight = 0.1
-    """Reward for each nat of divergence, at every step (the paper's alpha); 0 is MAPPO."""
+    """Reward for each nat of divergence of a step, as of the action that makes it (the paper's alpha); 0 is MAPPO."""
     kernel: Fraction = 0.5
     """Weight of a step's neighbour beside the step's own (the paper's gamma): 0 compares single actions, 1 all that an
     iteration has of an episode (`ppo.steps` at most)."""
@@ -173,7 +173,8 @@ class E3tConfig(Schema):
     """The partner of E3T (Yan et al. 2023): the member's own policy, mixed with chance."""
 
     epsilon: Fraction = 0.25
-    """Share of uniformly random actions among the partner's (the paper's epsilon); 0 is MAPPO."""
+    """Share of uniformly random actions among the partner's (the paper's epsilon); 0 is MAPPO. A quarter of `ppo.envs`
+    is without them: plain self-play tells the score, and is not learned from."""
 
 
 class E3tRun(BaselineRun):
@@ -202,6 +203,9 @@ class HspConfig(Schema):
     """Events with a weight in each biased agent's utility, drawn from HSP's list."""
     reward: Weight = 1.0
     """Weight of the true reward in every utility."""
+    least_score: Weight | None = 0.1
+    """Pairs whose own score, in their latest `ppo.window` episodes, is no higher are not chosen as long as others are
+    left; None chooses from all."""
 
 
 class HspRun(BaselineRun):

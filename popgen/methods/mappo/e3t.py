@@ -3,8 +3,11 @@
     J(j) = J(pi_j, (1 - epsilon) pi_j + epsilon uniform)
 
 A member plays beside its own policy, which takes a random action now and then, in both seatings; only its own seat is
-learned from. The paper's module that predicts the partner's actions from the episode so far is left out: members have
-no memory. One stage, one member after the other, which differ by their seeds.
+learned from. In one of `PLAIN_ONE_IN` environments it plays plainly with itself instead, which is not learned from:
+`sp`, to which `ppo.target_score` is compared as in every other method, is that play's, `sp_noisy` the other's. Both
+count as self-play, in the ledger and in `ppo.max_steps`. The paper's module that predicts the partner's actions from
+the episode so far is left out: members have no memory. One stage, one member after the other, which differ by their
+seeds.
 """
 
 from __future__ import annotations

@@ -3,7 +3,9 @@
     J(j) = J_SP(j)
 
 Each seed gives three members: the policy it started from, one on its way whose self-play is nearest to half of the
-final one's, and the final one. All of a seed's environment steps are counted for its final member.
+final one's, and the final one. A policy on the way has the score of the iteration that it played, and of no other; the
+final one, which has played none yet, that of the latest `ppo.window` episodes before it, as every method's members.
+All of a seed's environment steps and seconds are counted for its final member.
 """
 
 from __future__ import annotations
@@ -13,12 +15,13 @@ from collections.abc import Iterator
 from popgen.envs.contract import EnvSpec
 from popgen.methods.mappo.config import FcpRun
 from popgen.methods.mappo.objective import SELF_PLAY
+from popgen.methods.mappo.play_record import rate_self_play
 from popgen.methods.mappo.train import RllibTraining, refuse_inline
 from popgen.methods.mappo.training_job import policy_config
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
 from popgen.methods.training import Checkpoint, Loop, PlannedPhase, State, TrainedMember, Transport
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
-from popgen.types import SKILLS
+from popgen.types import SKILLS, Weights
 
 
 class FcpTraining(RllibTraining):
@@ -27,6 +30,7 @@ class FcpTraining(RllibTraining):
     def __init__(self, config: FcpRun, spec: EnvSpec, attempt: str) -> None:
         super().__init__(config, spec, attempt, SELF_PLAY)
         self.skills = SkillCheckpoints()
+        self.acting: tuple[int, Weights] = (0, {})  # who plays the next iteration, so many steps into the training
 
     def first_of_group(self, member: int) -> int:
         """The initial member of the seed that `member` is of."""
@@ -41,19 +45,22 @@ class FcpTraining(RllibTraining):
         final = first + len(SKILLS) - 1
         super().begin(final)
         self.skills = SkillCheckpoints()
-        self._keep_policy(0.0)
+        self._hold_actor()
         return tuple(range(first, final + 1))
 
     def report_iteration(self) -> Loop:
-        """The present policy is a candidate for the one at half skill."""
+        """The policy that has played this iteration is a candidate for the one at half skill; the first is the initial
+        one."""
         yield from super().report_iteration()
-        scores = self.algorithm.scores(self.learning[0])
-        if "sp" in scores:
-            self._keep_policy(scores["sp"])
+        score = rate_self_play(self.algorithm.report.counted, self.spec.horizon)
+        if score is not None:
+            steps, actor = self.acting
+            self.skills.add(SkillCheckpoint(steps, score, actor))
+        self._hold_actor()
 
-    def _keep_policy(self, score: float) -> None:
+    def _hold_actor(self) -> None:
         final = self.learning[0]
-        self.skills.add(SkillCheckpoint(self.progress.steps[final], score, self.algorithm.actors()[final]))
+        self.acting = self.progress.steps[final], self.algorithm.actors()[final]
 
     def finish_members(self) -> Iterator[TrainedMember]:
         """The three of this seed."""
@@ -62,7 +69,7 @@ class FcpTraining(RllibTraining):
         chosen = (self.skills.kept[0], self.skills.nearest(reached / 2.0))
         for number, (skill, checkpoint) in enumerate(zip(SKILLS, chosen, strict=False)):
             member = final.member - len(SKILLS) + 1 + number
-            extra = {"skill": skill, "of_member": final.member, "at_steps": checkpoint.steps, "sp": checkpoint.score}
+            extra = {"skill": skill, "of_member": final.member, **checkpoint.figures()}
             policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), checkpoint.actor, self.spec)
             self.archive[member] = policy.weights()
             note = f"member {member}: {skill} of member {final.member}, {checkpoint.steps:,} steps into its training"
@@ -78,6 +85,7 @@ class FcpTraining(RllibTraining):
         """See `Training`."""
         super().restore(checkpoint)
         self.skills = SkillCheckpoints.from_state(checkpoint.state["skills"])
+        self._hold_actor()
 
 
 def open_training(config: FcpRun, spec: EnvSpec, attempt: str, transport: Transport) -> FcpTraining:

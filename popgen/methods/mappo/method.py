@@ -15,6 +15,7 @@ from popgen.methods.mappo.config import (
 from popgen.methods.mappo.needs import (
     check_brdiv,
     check_comedi,
+    check_e3t,
     check_fcp,
     check_hsp,
     check_view,
@@ -182,5 +183,5 @@ E3T = Method(
     training="popgen.methods.mappo.e3t:open_training",
     actors=list_actors,
     needs=estimate_mappo,
-    check=check_view,
+    check=check_e3t,
 )

@@ -15,6 +15,7 @@ from popgen.methods.mappo.config import (
     BrdivConfig,
     BrdivRun,
     ComediRun,
+    E3tRun,
     FcpRun,
     HspConfig,
     HspRun,
@@ -164,6 +165,17 @@ def check_comedi(config: ComediRun, spec: EnvSpec) -> None:
     check_view(config, spec)
     if config.diversity.order != "sequential":
         raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")
+
+
+def check_e3t(config: E3tRun, spec: EnvSpec) -> None:
+    """The view, and an environment for each seating and for plain self-play.
+
+    Raises:
+        UserError: a view that the environment does not have, or too few environments.
+    """
+    check_view(config, spec)
+    if config.e3t.epsilon > 0.0 and config.ppo.envs < 3:
+        raise UserError("ppo.envs", "E3T plays in two seatings, and plainly with itself", "set it to at least 3")
 
 
 def check_fcp(config: FcpRun, spec: EnvSpec) -> None:

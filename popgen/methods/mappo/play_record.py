@@ -15,7 +15,7 @@ from popgen.methods.mappo.pooling import Plan
 from popgen.methods.mappo.slots import Rollout
 from popgen.methods.mappo.training_job import Job
 from popgen.play.partner_strength import PartnerConstraint, PartnerStrength, any_then_strongest
-from popgen.play.rollout import Match
+from popgen.play.rollout import Match, columns_of
 from popgen.types import Kind
 
 HABIT_DECAY = 0.9
@@ -24,7 +24,14 @@ HABIT_DECAY = 0.9
 
 @dataclass(frozen=True)
 class Counted:
-    """Environment steps of one owner and kind in one call of one runner."""
+    """Environment steps of one owner and kind in one call of one runner.
+
+    Attributes:
+        runner, owner, kind, steps: who stepped how many, for whom.
+        episodes, score: those that ended with these steps, and the sum of their scores.
+        earned: score of these steps alone, whenever their episodes end.
+        covered: steps of an episode that these stand for (`popgen.envs.reward.covered_steps`).
+    """
 
     runner: int
     owner: int
@@ -32,6 +39,8 @@ class Counted:
     steps: int
     episodes: int
     score: float
+    earned: float = 0.0
+    covered: float = 0.0
 
 
 @dataclass
@@ -39,6 +48,19 @@ class _Total:
     steps: int = 0
     episodes: int = 0
     score: float = 0.0
+    earned: float = 0.0
+    covered: float = 0.0
+
+
+def rate_self_play(counted: Sequence[Counted], horizon: int) -> float | None:
+    """Self-play's score an episode, by the score of these steps alone; None without any.
+
+    The policies that took the steps, and no earlier ones, are behind it. Episodes of all ages must be among the steps,
+    which staggered ones are.
+    """
+    played = [one for one in counted if one.kind is Kind.SP]
+    covered = sum(one.covered for one in played)
+    return horizon * sum(one.earned for one in played) / covered if covered else None
 
 
 class PlayRecord:
@@ -52,6 +74,8 @@ class PlayRecord:
         limit, step = (None, 0.0) if job.diversity is None else (job.diversity.xp_limit, job.diversity.multiplier_step)
         self.constraints = {m: PartnerConstraint(limit, step) for m in job.learning}
         self.own: dict[int, deque[float]] = {m: deque(maxlen=job.ppo.window) for m in job.owners}
+        noisy = [m for m in job.owners if job.is_noisy(m)]
+        self.noisy: dict[int, deque[float]] = {m: deque(maxlen=job.ppo.window) for m in noisy}
         self.taken = dict.fromkeys(job.owners, 0)  # self-play steps
         self.habits: dict[int, np.ndarray] = {}  # moving mean of each player's events of a step, in its own play
         self.rng = np.random.default_rng(job.seed)
@@ -67,9 +91,11 @@ class PlayRecord:
         return self.progress >= 1.0 or all(self.is_target_reached(member) for member in self.job.owners)
 
     def scores(self, member: int) -> dict[str, float]:
-        """Mean scores of the latest episodes: `sp`, and `xp` of the partner with the highest."""
-        scores = self.own[self.job.owner_of(member)]
-        own = {"sp": float(np.mean(scores))} if scores else {}
+        """Mean scores of the latest episodes: `sp`, `sp_noisy` beside the own policy with random actions, and `xp` of
+        the partner with the highest."""
+        owner = self.job.owner_of(member)
+        windows = {"sp": self.own[owner], "sp_noisy": self.noisy.get(owner)}
+        own = {name: float(np.mean(scores)) for name, scores in windows.items() if scores}
         cross = self.partners[member].mean_scores()
         return own | ({"xp": max(cross.values())} if cross else {})
 
@@ -122,9 +148,11 @@ class PlayRecord:
     def add(self, runner: int, rollout: Rollout, *, judge_partners: bool) -> list[Counted]:
         """Steps and episodes by owner and kind; scores to the windows, cross-play's where `judge_partners`."""
         totals: dict[tuple[int, Kind], _Total] = defaultdict(_Total)
-        for match in rollout.matches:
-            played = len(rollout.reward) * match.envs
-            totals[match.owner, match.kind].steps += played
+        for match, columns in zip(rollout.matches, columns_of(rollout.matches), strict=True):
+            played, total = len(rollout.reward) * match.envs, totals[match.owner, match.kind]
+            total.steps += played
+            total.earned += float(rollout.score[:, columns].sum(dtype=np.float64))
+            total.covered += float(rollout.covered[:, columns].sum(dtype=np.float64))
             if match.kind is Kind.SP:
                 self.taken[match.owner] += played
         self._add_habits(rollout)
@@ -133,14 +161,12 @@ class PlayRecord:
             total.episodes += 1
             total.score += episode.score
             if episode.kind is Kind.SP:
-                self.own[episode.owner].append(episode.score)
+                windows = self.noisy if min(episode.members) < 0 else self.own
+                windows[episode.owner].append(episode.score)
             elif episode.kind is Kind.XP and judge_partners:
                 for member in set(episode.members) & set(self.job.learning):
                     self.partners[member].add(episode.partner_of(member), [episode.shaped], [episode.score])
-        return [
-            Counted(runner, owner, kind, total.steps, total.episodes, total.score)
-            for (owner, kind), total in totals.items()
-        ]
+        return [Counted(runner, owner, kind, **vars(total)) for (owner, kind), total in totals.items()]
 
     def _add_habits(self, rollout: Rollout) -> None:
         """A tenth of the moving mean is what each player did in these steps."""
@@ -171,6 +197,7 @@ class PlayRecord:
             "partners": {str(m): strength.state() for m, strength in self.partners.items()},
             "constraints": {str(m): constraint.state() for m, constraint in self.constraints.items()},
             "own": {str(m): list(scores) for m, scores in self.own.items()},
+            "noisy": {str(m): list(scores) for m, scores in self.noisy.items()},
             "taken": {str(m): steps for m, steps in self.taken.items()},
             "habits": {str(m): habits.copy() for m, habits in self.habits.items()},
             "rng": self.rng.bit_generator.state,
@@ -185,5 +212,8 @@ class PlayRecord:
             self.own[member].clear()
             self.own[member].extend(state["own"][str(member)])
             self.taken[member] = int(state["taken"][str(member)])
+        for member, scores in self.noisy.items():
+            scores.clear()
+            scores.extend(state["noisy"][str(member)])
         self.habits = {int(m): np.array(habits) for m, habits in state["habits"].items()}
         self.rng.bit_generator.state = state["rng"]

@@ -197,8 +197,18 @@ COMEDI_RECIPES = _with_diversity(
 LIPO_OBJECTIVES, COMEDI_OBJECTIVES = _objectives(0.25), _objectives(0.5)
 """Rows of the table of self-sabotage."""
 
-HSP_RECIPES = _with_pairs({"hsp.select": because("events", "the paper's: the biased agents do different things")})
+HSP_RECIPES = _with_pairs(
+    {
+        "hsp.select": because("events", "the paper's: the biased agents do different things"),
+        "hsp.least_score": because(0.1, "ZSC-Eval drops pairs of HSP that deliver nothing"),
+    }
+)
 
-BP_RECIPES = _with_pairs({"hsp.select": because("responses", "ZSC-Eval's: their best responses do different things")})
+BP_RECIPES = _with_pairs(
+    {
+        "hsp.select": because("responses", "ZSC-Eval's: their best responses do different things"),
+        "hsp.least_score": because(0.5, "ZSC-Eval drops pairs with at most 10 points, half a dish"),
+    }
+)
 
 BRDIV_RECIPES = _with_crossed_pairs()

@@ -34,6 +34,7 @@ class Rollout:
         actions: (T, N, P) uint8.
         log_prob: (T, N, P) float32, of the actions under the policies that took them.
         reward: (T, N) float32, the joint training reward (`popgen.envs.reward`).
+        score: (T, N) float32, the environment's score of each step.
         covered: (T, N) float32, steps that each reward stands for (`popgen.envs.reward.covered_steps`).
         terminated, truncated: (T, N) bool.
         seats: (T, N, P) int32, the member who acted.
@@ -48,6 +49,7 @@ class Rollout:
     actions: np.ndarray
     log_prob: np.ndarray
     reward: np.ndarray
+    score: np.ndarray
     covered: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
@@ -186,7 +188,7 @@ class _SlotRun:
         self.actions = np.empty((steps, count, spec.num_players), np.uint8)
         self.log_prob = np.empty(self.actions.shape, np.float32)
         self.seats = np.empty(self.actions.shape, np.int32)
-        self.rewards, self.covered = (np.empty((steps, count), np.float32) for _ in range(2))
+        self.rewards, self.scores, self.covered = (np.empty((steps, count), np.float32) for _ in range(3))
         self.terminated, self.truncated = np.empty((steps, count), bool), np.empty((steps, count), bool)
         kinds = len(name_player_events(self.env)) if pool.events else 0
         self.events = np.zeros((*self.actions.shape, kinds), np.uint8)
@@ -220,6 +222,7 @@ class _SlotRun:
             self.events[t] = count_player_events(self.env, states, self.actions[t], result)
         self.rewards[t] = training_reward(self.pool.spec, result)
         self.terminated[t], self.truncated[t] = result.terminated, result.truncated
+        self.scores[t] = result.score
         self.score += result.score
         self.reward += self.rewards[t]
         self.age += 1
@@ -273,6 +276,7 @@ class _SlotRun:
             actions=self.actions,
             log_prob=self.log_prob,
             reward=self.rewards,
+            score=self.scores,
             covered=self.covered,
             terminated=self.terminated,
             truncated=self.truncated,

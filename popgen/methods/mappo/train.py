@@ -12,8 +12,8 @@ gives no more than this loop over its iterations.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 import torch
 
@@ -23,6 +23,7 @@ from popgen.errors import UserError
 from popgen.methods.mappo.algorithm import Mappo, build_algorithm
 from popgen.methods.mappo.config import BaselineRun, DiversityConfig, PartnerRun
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
+from popgen.methods.mappo.play_record import Counted
 from popgen.methods.mappo.training_job import Job, policy_config
 from popgen.methods.training import (
     Checkpoint,
@@ -31,6 +32,7 @@ from popgen.methods.training import (
     Phase,
     PlannedPhase,
     Progress,
+    Record,
     Round,
     State,
     StepCount,
@@ -41,8 +43,19 @@ from popgen.nets.weights import prefixed
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.types import Kind, Weights
 
-SCORES = ("sp", "xp")
-"""Figures of whole episodes, `real_...` in the metrics; an iteration lacks them until some have ended."""
+SCORES = ("sp", "sp_noisy", "xp")
+"""Figures of whole episodes, `real_...` in the metrics; an iteration lacks them until some have ended. `sp_noisy` is
+beside a member's own policy with random actions (E3T)."""
+
+
+def name_figure(name: str) -> str:
+    """A figure's name in the metrics: `real_NAME` for scores, `ppo/NAME` for a learner's; `OF/NAME` has its own."""
+    return f"real_{name}" if name in SCORES else name if "/" in name else f"ppo/{name}"
+
+
+def title_score(name: str) -> str:
+    """A score's name in a line: SP, SP NOISY, XP."""
+    return name.upper().replace("_", " ")
 
 
 @dataclass
@@ -157,11 +170,10 @@ class RllibTraining:
         """An iteration's step counts, then each member's figures."""
         report, ppo, now = self.algorithm.report, self.config.ppo, self.progress
         counts: list[StepCount] = []
-        for number, one in enumerate(report.counted, now.sequence):
+        for number, one in enumerate(self.assign_counts(report.counted), now.sequence):
             name = f"runner{one.runner}.{self.attempt}"
-            member = self.member_of(one.owner)
-            counts.append(StepCount(member, one.kind, name, number, one.steps, one.episodes, one.score))
-            now.steps[member] += one.steps
+            counts.append(StepCount(one.owner, one.kind, name, number, one.steps, one.episodes, one.score))
+            now.steps[one.owner] += one.steps
         now.sequence += len(counts)
         first = self.learning[0]
         yield Progress(first, now.steps[first], counted=tuple(counts))
@@ -170,9 +182,13 @@ class RllibTraining:
             yield Progress(first, now.steps[first], note=text)
         update_ms = 1000.0 * report.seconds["learning"] / (ppo.epochs * ppo.minibatches)
         for member, figures in self.figures_by_member().items():
-            shown = {f"real_{name}" if name in SCORES else f"ppo/{name}": value for name, value in figures.items()}
+            shown = {name_figure(name): value for name, value in figures.items()}
             shown |= {"ppo/update_ms": update_ms, "iteration": self.algorithm.rounds}
             yield Progress(member, now.steps[member], shown)
+
+    def assign_counts(self, counted: Sequence[Counted]) -> list[Counted]:
+        """An iteration's counts, each for the member as whose it goes to the ledger."""
+        return [replace(one, owner=self.member_of(one.owner)) for one in counted]
 
     def member_of(self, trained: int) -> int:
         """For which member the steps of one of RLlib's policies count."""
@@ -186,7 +202,7 @@ class RllibTraining:
         """The last iteration is kept in any case: members are added one after the other, which may be interrupted."""
         algorithm, steps = self.algorithm, self.progress.steps
         scores = [algorithm.scores(member) for member in algorithm.job.owners]
-        by_name = {name.upper(): [score[name] for score in scores if name in score] for name in SCORES}
+        by_name = {title_score(name): [score[name] for score in scores if name in score] for name in SCORES}
         means = {name: round(sum(values) / len(values), 2) for name, values in by_name.items() if values}
         return Round(
             self.learning[-1],
@@ -197,8 +213,8 @@ class RllibTraining:
             must_save=algorithm.finished,
         )
 
-    def finish_members(self) -> Iterator[TrainedMember]:
-        """All that this training gives."""
+    def finish_members(self) -> Iterator[Record]:
+        """All that this training gives, and what is to be said of it."""
         for member in self.learning:
             yield self.finish_member(member)
 
@@ -210,7 +226,7 @@ class RllibTraining:
         self.archive[member] = policy.weights()
         scores = algorithm.scores(number)
         extra = {**scores, "iterations": algorithm.rounds, "seconds": round(seconds / len(self.learning), 1)}
-        parts = ", ".join(f"{name.upper()} {value:.2f}" for name, value in scores.items())
+        parts = ", ".join(f"{title_score(name)} {value:.2f}" for name, value in scores.items())
         parts = f"{parts} {self.spec.score_name}" if parts else "no whole episode"
         steps = f"{self.progress.steps[member]:,} environment steps"
         return TrainedMember(

@@ -14,6 +14,9 @@ from popgen.nets.feed_forward import Sizes
 from popgen.play.rollout import Match
 from popgen.types import Kind, Weights
 
+PLAIN_ONE_IN = 4
+"""Beside a noisy partner: of so many environments of a member's own play it plays one plainly with itself."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -29,7 +32,8 @@ class Job:
         seed: of everything.
         bonus: added to self-play's reward.
         pairs: learning member -> who has the other seat in its play, where that is not itself: another learning member,
-            or -m for the member's own policy with random actions among its own.
+            or -m for the member's own policy with random actions among its own. Beside that it also plays plainly with
+            itself in some environments, which tell its score and are not learned from.
         utilities: learning member -> what it is paid in the training reward's place.
         noise: share of the random actions.
         all_partners: cross-play with every partner is trained on in each iteration, not with one of them.
@@ -91,12 +95,19 @@ class Job:
             matches += [Match(Kind.MP, (m, k), half, m), Match(Kind.MP, (k, m), half, m)]
         return matches
 
+    def is_noisy(self, member: int) -> bool:
+        """Does it learn beside its own policy with random actions?"""
+        return self.mate_of(member) == -member
+
     def _own_play(self, member: int) -> list[Match]:
-        """A member with itself, or its pair in both seatings."""
+        """A member with itself, or its pair in both seatings; beside a noisy partner also plainly with itself."""
         mate, envs = self.mate_of(member), self.ppo.envs
         if mate == member:
             return [Match(Kind.SP, (member, member), envs, member)]
-        seatings = ((member, mate), envs - envs // 2), ((mate, member), envs // 2)
+        plain = max(1, envs // PLAIN_ONE_IN) if self.is_noisy(member) else 0
+        envs -= plain
+        seatings = [((member, mate), envs - envs // 2), ((mate, member), envs // 2)]
+        seatings += [((member, member), plain)] if plain else []
         return [Match(Kind.SP, members, count, member) for members, count in seatings]
 
     def critics(self, member: int) -> list[str]:

@@ -4,7 +4,8 @@
 
 Member 1 and its world model are trained as in XPM-WM. Each later seed then learns in imagination, meets nobody, and
 gives three members, as `method=fcp` does: the policy it started from, that of the round whose real self-play is nearest
-to half of the final one's, and the final one. All of a seed's environment steps are counted for its final member.
+to half of the final one's, and the final one. All of a seed's environment steps and seconds are counted for its final
+member.
 """
 
 from __future__ import annotations
@@ -58,6 +59,6 @@ class FcpWmTraining(XpmWmTraining):
             member = final.member - len(SKILLS) + 1 + number
             policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
             policy.load(checkpoint.actor)
-            extra = {"skill": skill, "of_member": final.member, "at_steps": checkpoint.steps, "sp": checkpoint.score}
+            extra = {"skill": skill, "of_member": final.member, **checkpoint.figures()}
             note = f"member {member}: {skill} of member {final.member}, {checkpoint.steps:,} steps into its training"
             yield TrainedMember(member, policy, None, seed=final.seed, extra=extra, left=final.left, note=note)

@@ -19,10 +19,12 @@ from popgen.methods.mappo.config import PpoConfig
 from popgen.methods.mappo.hidden_utility import STEP_SHARE, Utility, draw_utility
 from popgen.methods.mappo.needs import check_hsp, estimate_hsp
 from popgen.methods.mappo.noisy_actor import mix_with_random
-from popgen.methods.mappo.play_record import HABIT_DECAY, PlayRecord
+from popgen.methods.mappo.play_record import HABIT_DECAY, Counted, PlayRecord, rate_self_play
 from popgen.methods.mappo.pooling import Plan, PooledBatch, gather, pool
 from popgen.methods.mappo.slots import SlotPool
 from popgen.methods.mappo.training_job import Job
+from popgen.methods.registry import METHODS
+from popgen.play.episodes import Episode
 from popgen.play.rollout import Match
 from popgen.types import Kind
 
@@ -136,12 +138,82 @@ def test_a_mixture_partner_has_the_mixed_probabilities(share: float) -> None:
     torch.testing.assert_close(mixed.exp(), expected)
 
 
+def mixture_job(**ppo: Any) -> Job:
+    """Member 2 beside itself with random actions."""
+    return Job(EnvConfig(), PPO.model_copy(update=ppo), None, (2,), seed=0, pairs={2: -2}, noise=0.25)
+
+
 def test_beside_a_mixture_partner_only_the_members_own_seat_is_learned_from() -> None:
-    job = Job(EnvConfig(), PPO, None, (2,), seed=0, pairs={2: -2}, noise=0.25)
-    assert [(m.members, m.envs) for m in job.matches()] == [((2, -2), 3), ((-2, 2), 2)]
+    """Of five environments one is plain self-play, which is not learned from at all; of 64 it is a quarter."""
+    job = mixture_job()
+    assert [(m.members, m.envs) for m in job.matches()] == [((2, -2), 2), ((-2, 2), 2), ((2, 2), 1)]
+    assert [(m.members, m.envs) for m in mixture_job(envs=64).matches()] == [((2, -2), 24), ((-2, 2), 24), ((2, 2), 16)]
+    assert {m.kind for m in job.matches()} == {Kind.SP} and {m.owner for m in job.matches()} == {2}
     assert job.owners == [2] and PlayRecord(job).plan(2, 0).mate == -2
-    found = gather([rollout(10, *job.matches())], Kind.SP, 2, -2)
-    assert found is not None and found.trained.sum() == 10 * 5 and found.seat.tolist() == [0, 0, 0, 1, 1]
+    played = rollout(10, *job.matches())
+    found = gather([played], Kind.SP, 2, -2)
+    assert found is not None and found.trained.sum() == 10 * 4 and found.seat.tolist() == [0, 0, 1, 1]
+    assert len(batch(2, Plan(mate=-2), played).action) == 10 * 4
+
+
+def played_by(*scores: tuple[tuple[int, int], float], **given: Any) -> Any:
+    """Ten steps of the mixture's environments, with these episodes of member 2 at their end."""
+    episodes = tuple(Episode(Kind.SP, members, score, 0.0, owner=2) for members, score in scores)
+    return rollout(10, *mixture_job().matches(), episodes=episodes, **given)
+
+
+def test_plain_self_play_alone_tells_whether_the_target_of_a_mixture_is_reached() -> None:
+    """Beside the noisy partner two episodes of 9, plainly one of 12, then another: the target is 11, the window 2."""
+    job = mixture_job(window=2, target_score=11.0, max_steps=10_000)
+    record = PlayRecord(job)
+    record.add(0, played_by(((2, -2), 8.0), ((-2, 2), 10.0), ((2, 2), 12.0)), judge_partners=True)
+    assert record.scores(2) == {"sp": 12.0, "sp_noisy": 9.0} and not record.finished
+    noisy = PlayRecord(job)
+    noisy.add(0, played_by(((2, -2), 12.0), ((-2, 2), 12.0)), judge_partners=True)
+    assert noisy.scores(2) == {"sp_noisy": 12.0} and not noisy.finished
+    again = PlayRecord(job)
+    again.load_state(record.state())
+    for one in (record, again):
+        one.add(0, played_by(((2, 2), 11.0)), judge_partners=True)
+        assert one.scores(2) == {"sp": 11.5, "sp_noisy": 9.0} and one.finished
+
+
+def test_all_play_of_a_mixture_is_counted_as_self_play() -> None:
+    record = PlayRecord(mixture_job())
+    counted = record.add(0, played_by(((2, -2), 8.0), ((2, 2), 12.0)), judge_partners=True)
+    assert [(one.owner, one.kind, one.steps, one.episodes, one.score) for one in counted] == [(2, Kind.SP, 50, 2, 20.0)]
+    assert record.taken == {2: 50}
+
+
+def test_a_mixture_needs_an_environment_of_each_kind() -> None:
+    def run(envs: int, epsilon: float) -> Any:
+        small = {"envs": envs, "minibatches": 1}
+        return RunConfig.parse({"method": "e3t", "ppo": small, "e3t": {"epsilon": epsilon}})
+
+    spec = make_env("overcooked/cramped_room", 1).spec
+    with pytest.raises(UserError, match=r"ppo.envs: .*plainly with itself.*set it to at least 3"):
+        METHODS["e3t"].check(run(2, 0.25), spec)
+    METHODS["e3t"].check(run(3, 0.25), spec)
+    METHODS["e3t"].check(run(1, 0.0), spec)
+
+
+def test_a_steps_score_belongs_to_the_policies_that_took_it() -> None:
+    """Two environments, ten steps of an episode of 40, two dishes: eight an episode. An episode that ends early stands
+    for the steps that it still had."""
+    score = np.zeros((10, 2), np.float32)
+    score[2, 0] = score[7, 1] = 1.0
+    record = PlayRecord(Job(EnvConfig(), PPO, None, (1,), seed=0))
+    sp = Match(Kind.SP, (1, 1), 2, 1)
+    counted = record.add(0, rollout(10, sp, score=score), judge_partners=True)
+    assert counted[0].earned == 2.0 and counted[0].covered == 20.0
+    assert rate_self_play(counted, 40) == pytest.approx(2.0 / 20.0 * 40)
+    covered = np.ones((10, 2), np.float32)
+    covered[4, 0] = 31.0
+    early = record.add(1, rollout(10, sp, score=score, covered=covered), judge_partners=True)
+    assert rate_self_play([*counted, *early], 40) == pytest.approx(4.0 / 70.0 * 40)
+    assert rate_self_play([], 40) is None
+    crossed = Counted(0, 1, Kind.XP, 20, 0, 0.0, earned=9.0, covered=20.0)
+    assert rate_self_play([*counted, crossed], 40) == rate_self_play(counted, 40)
 
 
 def test_half_pairs_and_small_pools_are_refused() -> None:

@@ -63,6 +63,7 @@ def test_a_rollout_is_what_the_environment_does(make: Callable[[int, int], Batch
         assert (rollout.obs[t] == env.observe()).all()
         result = env.step(rollout.actions[t])
         np.testing.assert_allclose(rollout.reward[t], training_reward(env.spec, result), rtol=1e-6)
+        np.testing.assert_array_equal(rollout.score[t], result.score)
         assert (rollout.terminated[t] == result.terminated).all() and (rollout.truncated[t] == result.truncated).all()
         for column in np.flatnonzero(result.truncated):
             cuts.append((t, int(column), env.observe()[column]))
