@@ -11,7 +11,7 @@ from typing import Any
 from popgen.actors.actor_setup import build_env, limit_threads
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
-from popgen.evaluation.holdout_players import NO_WEIGHTS
+from popgen.evaluation.holdout_lineages import NO_WEIGHTS, identify_member, merge_records, read_partners, read_people
 from popgen.methods.ego.config import BrRun, EgoRun
 from popgen.methods.ego.ego_learner import EgoLearner, EgoSetup, make_policy
 from popgen.methods.ego.ego_rollout import EndedEpisode
@@ -103,13 +103,32 @@ def _check_pinned(config: EgoRun, named: Sequence[NamedMembers]) -> None:
 
 
 def describe_partners(named: Sequence[NamedMembers]) -> list[PartnerSource]:
-    """Where they come from."""
-    sources: list[PartnerSource] = []
-    for one in named:
-        manifest = one.population.manifest
-        digests = tuple(one.population.info(member).policy_sha256 for member in one.members)
-        sources.append(PartnerSource(manifest.method, manifest.seed, manifest.config_digest, one.members, digests))
-    return sources
+    """Where they come from, and what they were trained with themselves.
+
+    Raises:
+        UserError: their records hold something else.
+    """
+    return [_describe_source(one) for one in named]
+
+
+def _describe_source(one: NamedMembers) -> PartnerSource:
+    population, place = one.population, str(one.population.path)
+    manifest, members = population.manifest, [population.info(member) for member in one.members]
+    for info in members:
+        read_partners(place, info.extra)  # what an ego's record takes over must be readable
+    nested = merge_records(members)
+    people = dict.fromkeys(read_people(place, info.extra) for info in members)
+    return PartnerSource(
+        method=manifest.method,
+        seed=manifest.seed,
+        config_digest=manifest.config_digest,
+        members=one.members,
+        policy_sha256=tuple(info.policy_sha256 for info in members),
+        identity=tuple(identify_member(info, manifest.environment.fingerprint) for info in members),
+        population_sha256=tuple(info.policy_sha256 for info in population.members),
+        people=tuple(group.as_dict() for group in people if group is not None),
+        trained_with=None if nested is None else tuple(nested),
+    )
 
 
 def build_partners(named: Sequence[NamedMembers]) -> list[Policy]:

@@ -1,7 +1,8 @@
 """What a hold-out evaluation says of each ego, beside each kind of partner.
 
-The reference of a partner and seat is the best response known to it: the partner's play with itself, or that of the
-best response trained for it, whichever scores more.
+The reference of a partner and seat is the best response known to it, whichever scores most: the partner itself, the
+mate of the pair that it was trained in, or the best response that was trained for it. Where none scores anything, there
+is no reference, and the partner has no BR-Prox in that seat.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from popgen.evaluation.holdout import SEATS, HoldoutResult
 from popgen.evaluation.holdout_metrics import (
     Interval,
     Spread,
+    bootstrap_gain,
     bootstrap_units,
     describe_spread,
     interquartile_mean,
@@ -56,14 +58,16 @@ class Standing:
 
     Attributes:
         ego, partners: labels; `partners` of a group, or of a set of groups.
-        count: partners.
+        count: partners, copies of one policy counted once.
+        referenced: those with a reference in a seat at least, beside whom BR-Prox is measured.
         score: mean, SD over episodes and SE of the mean (SD over the root of all episodes, as in the paper).
         interval: of the mean: over the ego's seeds, or over partners where it has one seed; NaN for one of each.
         seats: mean by the ego's seat.
         worst: the lowest pair.
         cvar: mean of the lowest quarter of pair means.
-        br_prox: inter-quartile mean of BR-Prox (clipped at 1) over seeds, partners and seats, with its interval.
-        br_prox_unclipped: mean without the bound, over pairs whose reference scores above 0.
+        br_prox: inter-quartile mean of BR-Prox (clipped at 1) over seeds, and the partners and seats that have a
+            reference, with its interval; NaN without any.
+        br_prox_unclipped: mean of the same without the bound.
         normalised: mean of score over the best score that anybody reached with the partner; NaN without one above 0.
         regret: mean of what the reference scores more than the ego.
     """
@@ -71,6 +75,7 @@ class Standing:
     ego: str
     partners: str
     count: int
+    referenced: int
     score: Spread
     interval: Interval
     seats: tuple[float, float]
@@ -84,12 +89,19 @@ class Standing:
 
 @dataclass(frozen=True)
 class Margin:
-    """How much more an ego scores than a control with the same partners and seats, with its interval over partners."""
+    """How much more an ego scores than a control with the same partners and seats.
+
+    Attributes:
+        ego, control, partners: labels.
+        gain: with its interval over what is resampled.
+        resampled: of `ego's seeds`, `control's seeds` and `partners` those of which there are several.
+    """
 
     ego: str
     control: str
     partners: str
     gain: Interval
+    resampled: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -104,10 +116,22 @@ ALL, OWN, CROSS = "all hold-outs", "own method", "other methods"
 """Labels of sets of groups: all but people; those of the methods that taught the ego; those of other methods."""
 
 
+BEST_RESPONSE, MATE, SELF_PLAY = "best response", "mate", "self-play"
+"""Kinds of references; of equal ones the first."""
+
+
+def list_references(result: HoldoutResult) -> dict[str, np.ndarray]:
+    """Kind -> (K, 2) mean scores of who may be the best response to each partner, by its seat; NaN where there is none.
+
+    A partner plays with itself in both seats, so that its score is the same in either.
+    """
+    alone = np.repeat(result.partner_alone.mean(-1)[:, None], len(SEATS), axis=1)
+    return {BEST_RESPONSE: result.responses.mean(-1), MATE: result.partner_mates.mean(-1), SELF_PLAY: alone}
+
+
 def find_references(result: HoldoutResult) -> np.ndarray:
     """(K, 2) mean scores of the best response known to each partner, by the seat of the response."""
-    alone = np.repeat(result.partner_alone.mean(-1)[:, None], len(SEATS), axis=1)
-    return np.fmax(alone, result.responses.mean(-1))
+    return np.fmax.reduce(list(list_references(result).values()))
 
 
 def list_sets(result: HoldoutResult, ego: Group) -> list[PartnerSet]:
@@ -130,7 +154,6 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
     scores = result.scores[np.ix_(rows, columns)]
     means, references = scores.mean(-1), find_references(result)[columns]
     best = np.fmax(references, result.scores.mean(-1).max(0)[columns])
-    clipped = measure_br_proximity(means, references)
     unclipped = measure_br_proximity(means, references, clip=False)
     useful = best > 0.0
     normalised = normalise_returns(means[:, useful], 0.0, best[useful]) if useful.any() else np.array([math.nan])
@@ -138,12 +161,13 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
         ego=ego.label,
         partners=chosen.label,
         count=len(columns),
+        referenced=int((references > 0.0).any(1).sum()),
         score=describe_spread(scores),
         interval=_bound_figure(means, np.mean),
         seats=(float(means[..., 0].mean()), float(means[..., 1].mean())),
         worst=_find_worst_pair(result, rows, columns),
         cvar=measure_cvar(means, CVAR_SHARE),
-        br_prox=_bound_figure(clipped),
+        br_prox=_bound_proximity(measure_br_proximity(means, references)),
         br_prox_unclipped=float(np.nanmean(unclipped)) if np.isfinite(unclipped).any() else math.nan,
         normalised=float(normalised.mean()),
         regret=float(measure_regret(means, references).mean()),
@@ -153,6 +177,14 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
 def _bound_figure(values: np.ndarray, estimate: Callable[[np.ndarray], float] = interquartile_mean) -> Interval:
     """Interval of a figure of (runs, K, 2): over whole runs, or where there is one over partners with both seats."""
     return bootstrap_units(values if len(values) > 1 else values[0], estimate, repetitions=REPETITIONS)
+
+
+def _bound_proximity(clipped: np.ndarray) -> Interval:
+    """The same of BR-Prox (runs, K, 2), over the partners and seats that have one."""
+    kept = clipped[:, np.isfinite(clipped).any((0, 2))]
+    if not kept.size:
+        return Interval(math.nan, math.nan, math.nan)
+    return _bound_figure(kept, lambda drawn: interquartile_mean(drawn[np.isfinite(drawn)]))
 
 
 def _find_worst_pair(result: HoldoutResult, rows: Sequence[int], columns: Sequence[int]) -> Worst:
@@ -169,7 +201,8 @@ def describe_all(result: HoldoutResult) -> list[Standing]:
 
 
 def measure_margins(result: HoldoutResult, control: str) -> list[Margin]:
-    """What every other ego scores more than the ego `control`, beside each group of partners and all hold-outs.
+    """What every other ego scores more than the ego `control`, beside each group of partners and all hold-outs; see
+    `bootstrap_gain` for the intervals.
 
     Raises:
         UserError: there is no ego of that name.
@@ -177,14 +210,17 @@ def measure_margins(result: HoldoutResult, control: str) -> list[Margin]:
     egos = [group.label for group in result.casting.egos]
     if control not in egos:
         raise UserError("--control", f"there is no ego {control}", f"choose among {', '.join(egos)}")
-    base = result.scores[result.casting.rows(control)].mean((0, -1))
+    base = result.scores[result.casting.rows(control)].mean(-1)
     found = []
     for ego in result.casting.egos:
         if ego.label == control:
             continue
-        gains = result.scores[result.casting.rows(ego.label)].mean((0, -1)) - base
+        own = result.scores[result.casting.rows(ego.label)].mean(-1)
         for chosen in list_sets(result, ego):
             if chosen.label not in (OWN, CROSS):
-                gain = _bound_figure(gains[list(chosen.columns)][None], np.mean)
-                found.append(Margin(ego.label, control, chosen.label, gain))
+                columns = list(chosen.columns)
+                gain = bootstrap_gain(own[:, columns], base[:, columns], repetitions=REPETITIONS)
+                counts = {"ego's seeds": len(own), "control's seeds": len(base), "partners": len(columns)}
+                several = tuple(name for name, count in counts.items() if count > 1)
+                found.append(Margin(ego.label, control, chosen.label, gain, several))
     return found

@@ -57,12 +57,13 @@ def measure_br_proximity(means: np.ndarray, best: np.ndarray, *, clip: bool = Tr
         clip: bound by 1, as published, which hides egos better than a poor best response.
 
     Returns:
-        (E, K, P). Where the best response scores nothing or less, 1 as published (nan unclipped: it says nothing).
+        (E, K, P). NaN where the best response scores nothing or less: a ratio to that says nothing. As published it is
+        1 there, which the worst ego has too.
     """
     means, best = np.asarray(means, np.float64), np.asarray(best, np.float64)
     check(best, means.shape[1:], "best")
     useful = np.broadcast_to(best > 0.0, means.shape)
-    ratio = np.divide(means, best, out=np.full(means.shape, 1.0 if clip else math.nan), where=useful)
+    ratio = np.divide(means, best, out=np.full(means.shape, math.nan), where=useful)
     return np.minimum(ratio, 1.0) if clip else ratio
 
 
@@ -165,6 +166,39 @@ def bootstrap_units(
     drawn = [estimate(values[rng.integers(units, size=units)]) for _ in range(repetitions)]
     low, high = np.quantile(drawn, [0.025, 0.975])
     return Interval(figure, float(low), float(high))
+
+
+def bootstrap_gain(own: np.ndarray, base: np.ndarray, *, repetitions: int = 2000) -> Interval:
+    """How much larger one mean is than another over the same partners, with its 95 % percentile bootstrap interval.
+
+    Drawn anew are the runs of either, each on its own, and the partners, which both have in common and which are drawn
+    whole, with all their seats. What there is one of stays as it is.
+
+    Args:
+        own, base: (R, K, P) and (S, K, P) mean scores of R and of S runs beside K partners.
+        repetitions: of the bootstrap.
+
+    Returns:
+        Mean of `own` less mean of `base`; low and high are NaN where there is one run of either and one partner.
+
+    Raises:
+        ValueError: there are no values, or not the same partners.
+    """
+    own, base = np.asarray(own, np.float64), np.asarray(base, np.float64)
+    if own.ndim != 3 or not own.size or not base.size:
+        raise ValueError(f"own, base: expected (runs, partners, seats), got shapes {own.shape} and {base.shape}")
+    check(base, (len(base), *own.shape[1:]), "base")
+    gain, (runs, partners, _), controls = float(own.mean() - base.mean()), own.shape, len(base)
+    if runs == partners == controls == 1:
+        return Interval(gain, math.nan, math.nan)
+    own, base = own.mean(-1), base.mean(-1)
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(repetitions):
+        columns = rng.integers(partners, size=partners)
+        rows, others = rng.integers(runs, size=runs), rng.integers(controls, size=controls)
+        drawn.append(own[np.ix_(rows, columns)].mean() - base[np.ix_(others, columns)].mean())
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Interval(gain, float(low), float(high))
 
 
 def _resample(scores: np.ndarray, over_tasks: bool, rng: np.random.Generator) -> np.ndarray:

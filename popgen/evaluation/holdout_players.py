@@ -1,8 +1,7 @@
-"""Who plays in a hold-out evaluation: egos, hold-out partners, and the proof that they have nothing in common.
+"""Who plays in a hold-out evaluation: egos, hold-out partners, and best responses to these.
 
 A group is one name: an ego with its seeds, or the partners of one kind. A player is one policy of a group. An ego is an
-ordinary population folder; what it was trained beside stands in the record of its members under `trained_with`: a list
-of objects, one for each population, with the keys method, seed, config_digest and policy_sha256 (a list) among others.
+ordinary population folder; what it was trained with stands in its members' records (`holdout_lineages`).
 """
 
 from __future__ import annotations
@@ -15,42 +14,21 @@ from typing import Any
 from popgen.envs.contract import BatchedEnv
 from popgen.envs.env_registry import make_env
 from popgen.errors import UserError
+from popgen.evaluation.holdout_lineages import (
+    Lineage,
+    describe_lineage,
+    identify_member,
+    is_on_record,
+    read_partners,
+)
 from popgen.evaluation.user_agents import is_agent_name, open_user_agent
-from popgen.methods.registry import METHODS
 from popgen.play.policy import Policy
 from popgen.population import Population, load_population
-from popgen.population.files import digest, to_tensors
-from popgen.population.manifest import EnvironmentInfo
+from popgen.population.manifest import EnvironmentInfo, MemberInfo
+from popgen.population.member_pairs import match_pairs, read_pair
 
 EGO = "ego"
 """The side of egos; all others are of partners."""
-
-TRAINED_WITH = "trained_with"
-"""Key in a member's `extra` under which an ego's training partners stand."""
-
-NO_WEIGHTS = digest(to_tensors(Path("policy.safetensors"), {}))
-"""Digest of the weights of a policy that has none; two of these have learned nothing from each other."""
-
-
-@dataclass(frozen=True)
-class Lineage:
-    """Where a population comes from: two of one lineage may share what they learned.
-
-    Attributes:
-        method, seed: of its run. Two runs of one method and seed start from the same weights.
-        config_digest: of its run; tells apart what no method of the registry made, such as clones of people.
-        digests: of its members' weights.
-    """
-
-    method: str
-    seed: int
-    config_digest: str
-    digests: frozenset[str] = frozenset()
-
-    def is_related(self, other: Lineage) -> bool:
-        """Whether both come from one seed of one method."""
-        same = (self.method, self.seed) == (other.method, other.seed)
-        return same and (self.method in METHODS or self.config_digest == other.config_digest)
 
 
 @dataclass(frozen=True)
@@ -65,6 +43,8 @@ class Player:
         make: () -> the policy.
         part: skill or role of a member of which its population has several kinds, "" elsewhere.
         pair: number of the pair that it was trained in (HSP), 0 for a member that was trained with itself.
+        identity: sha256 of all that decides how it acts (`identify_member`), None for a user's agent. Players with one
+            identity are the same policy, which counts once.
     """
 
     group: str
@@ -74,11 +54,28 @@ class Player:
     make: Callable[[], Policy]
     part: str = ""
     pair: int = 0
+    identity: str | None = None
 
     @property
     def name(self) -> str:
         """For tables and messages."""
         return f"{self.group} {self.member}"
+
+
+@dataclass(frozen=True)
+class Response:
+    """A best response that was trained for a partner.
+
+    Attributes:
+        player: that plays.
+        scale, settings: of its training: the recipe, and dotted field -> value on top of it.
+        steps: environment steps of its training.
+    """
+
+    player: Player
+    scale: str
+    settings: Mapping[str, Any]
+    steps: int
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,8 @@ class Group:
         method: that trained them; None for a user's agent.
         players: in order.
         lineages: of the populations that they come from.
-        partners: lineages of the populations that they were trained with; empty where nothing is known of any.
+        partners: lineages of the populations that they were trained with, and of those that these were trained with;
+            empty where nothing is known of any.
         on_record: the records of all say with whom they were trained, if with nobody.
     """
 
@@ -103,7 +101,7 @@ class Group:
 
     @property
     def taught_by(self) -> frozenset[str]:
-        """Methods of the populations it was trained with; its own method where there were none."""
+        """Methods of the populations in `partners`; its own method where there are none."""
         found = frozenset(one.method for one in self.partners)
         return found or frozenset([self.method] if self.method else [])
 
@@ -183,49 +181,31 @@ def _check_environment(population: Population, environment: EnvironmentInfo) -> 
 
 
 def _describe_population(label: str, population: Population) -> Group:
-    manifest = population.manifest
-    players = tuple(
-        Player(
-            *(label, str(population.path), info.id, info.policy_sha256, _open_member(population, info.id)),
-            part=str(info.extra.get("skill") or info.extra.get("role") or ""),
-            pair=_read_pair(info.extra),
-        )
-        for info in population.members
-    )
-    digests = frozenset(info.policy_sha256 for info in population.members) - {NO_WEIGHTS}
-    own = Lineage(manifest.method, manifest.seed, manifest.config_digest, digests)
+    players = tuple(_describe_member(label, population, info) for info in population.members)
     partners = [one for info in population.members for one in read_partners(str(population.path), info.extra)]
-    on_record = all(TRAINED_WITH in info.extra for info in population.members)
-    return Group(label, manifest.method, players, (own,), tuple(dict.fromkeys(partners)), on_record)
+    on_record = all(is_on_record(info.extra) for info in population.members)
+    own = (describe_lineage(population),)
+    return Group(label, population.manifest.method, players, own, tuple(dict.fromkeys(partners)), on_record)
 
 
-def _read_pair(extra: Mapping[str, Any]) -> int:
-    pair = extra.get("pair", 0)
-    return pair if type(pair) is int and "role" in extra else 0
+def _describe_member(label: str, population: Population, info: MemberInfo) -> Player:
+    return Player(
+        *(label, str(population.path), info.id, info.policy_sha256, lambda: population[info.id]),
+        part=str(info.extra.get("skill") or info.extra.get("role") or ""),
+        pair=read_pair(info.extra),
+        identity=identify_member(info, population.env_info.fingerprint),
+    )
 
 
-def _open_member(population: Population, member: int) -> Callable[[], Policy]:
-    return lambda: population[member]
+def find_mates(players: Sequence[Player]) -> tuple[int, ...]:
+    """Place of each player's mate among them, the other of the pair that it was trained in; its own without one."""
+    return match_pairs([(one.source, one.pair) if one.pair else None for one in players])
 
 
-def read_partners(place: str, extra: Mapping[str, Any]) -> list[Lineage]:
-    """Lineages of the populations that a member was trained with, by its record.
-
-    Raises:
-        UserError: the record holds something else.
-    """
-    try:
-        return [
-            Lineage(
-                method=str(one["method"]),
-                seed=int(one["seed"]),
-                config_digest=str(one["config_digest"]),
-                digests=frozenset(map(str, one["policy_sha256"])) - {NO_WEIGHTS},
-            )
-            for one in extra.get(TRAINED_WITH) or []
-        ]
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise UserError(place, f"{TRAINED_WITH} of a member cannot be read", "restore it from a good copy") from None
+def list_distinct(players: Sequence[Player]) -> list[int]:
+    """Places of the players that are no copy of an earlier one; users' agents are none."""
+    known = [one.identity for one in players]
+    return [place for place, own in enumerate(known) if own is None or own not in known[:place]]
 
 
 def _describe_agent(label: str, source: str, rules: BatchedEnv) -> Group:
@@ -246,32 +226,3 @@ def _join_groups(first: Group, second: Group) -> Group:
         tuple(dict.fromkeys(first.partners + second.partners)),
         first.on_record and second.on_record,
     )
-
-
-def check_disjoint(egos: Sequence[Group], partners: Sequence[Group]) -> None:
-    """Make sure that no ego has met a partner, or learned from what a partner learned from.
-
-    Raises:
-        UserError: one line that names both, for a shared member, a training partner, or one seed of one method.
-    """
-    fix = "hold out populations of other seeds"
-    for ego in egos:
-        own = frozenset[str]().union(*(one.digests for one in ego.lineages))
-        met = frozenset[str]().union(*(one.digests for one in ego.partners))
-        for partner in (player for group in partners for player in group.players):
-            if partner.digest in own:
-                raise UserError(partner.source, f"member {partner.member} is the ego {ego.label} itself", fix)
-            if partner.digest in met:
-                problem = f"member {partner.member} is a training partner of the ego {ego.label}"
-                raise UserError(partner.source, problem, fix)
-        for group in partners:
-            _check_lineages(ego, group, fix)
-
-
-def _check_lineages(ego: Group, partner: Group, fix: str) -> None:
-    for theirs in partner.lineages:
-        for ours in (*ego.lineages, *ego.partners):
-            if ours.is_related(theirs):
-                what = "trained with" if ours in ego.partners else "itself of"
-                problem = f"has seed {theirs.seed} of {theirs.method}, which the ego {ego.label} is {what}"
-                raise UserError(partner.label, problem, fix)

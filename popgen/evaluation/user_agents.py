@@ -12,6 +12,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from textwrap import shorten
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -104,32 +105,55 @@ def open_user_agent(text: str, env: BatchedEnv) -> Callable[[], Policy]:
     """A maker of policies from `module:Agent`; the module is imported, also from the working folder.
 
     Raises:
-        UserError: no such module or name, or it makes something else than a policy or an agent.
+        UserError: no such module or name, a module that cannot be run, or it makes something else than a policy or an
+            agent.
     """
+    found = _import_named(text)
+    try:
+        make = _make_things(found, env.spec)
+        first = make()
+        foreign = _is_foreign(first)
+        missing = [] if foreign else [part for part in PLAYS if not hasattr(first, part)]
+        view = None if foreign or missing else first.view
+    except (Exception, SystemExit) as error:  # of the user's own code
+        raise UserError(text, f"cannot be made ({_describe_fault(error)})", "see docs/evaluation.md") from error
+    if foreign:
+        if not isinstance(env, OvercookedEnv):
+            raise UserError(text, f"is an agent of overcooked_ai, {env.spec.name} is another game", "give a policy")
+        return lambda: ForeignAgentPolicy(make, env)
+    if missing:
+        problem = f"is neither a policy nor an agent of overcooked_ai (it has no {', '.join(missing)})"
+        raise UserError(text, problem, "see popgen.play.policy.Policy")
+    if not isinstance(view, str) or view not in env.spec.views:
+        raise UserError(text, f"wants the view {view!r}", f"choose among {', '.join(env.spec.views)}")
+    return make
+
+
+def _import_named(text: str) -> Any:
+    """What `module:Agent` names; the module is run, and may do anything but end the process."""
     module, _, name = text.partition(":")
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
     try:
         found: Any = import_module(module)
+    except ImportError as error:
+        raise UserError(text, f"cannot be imported ({error})", "give module:Agent as Python would import it") from None
+    except (Exception, SystemExit) as error:
+        problem = f"the module {module} fails when it is imported ({_describe_fault(error)})"
+        raise UserError(text, problem, f"correct it: python -c 'import {module}' shows where") from error
+    try:
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError) as error:
-        raise UserError(text, f"cannot be imported ({error})", "give module:Agent as Python would import it") from None
-    make = _make_things(found, env.spec)
-    try:
-        first = make()
-    except Exception as error:  # of the user's own code
-        raise UserError(text, f"cannot be made ({type(error).__name__}: {error})", "see docs/evaluation.md") from error
-    if _is_foreign(first):
-        if not isinstance(env, OvercookedEnv):
-            raise UserError(text, f"is an agent of overcooked_ai, {env.spec.name} is another game", "give a policy")
-        return lambda: ForeignAgentPolicy(make, env)
-    if missing := [part for part in PLAYS if not hasattr(first, part)]:
-        problem = f"is neither a policy nor an agent of overcooked_ai (it has no {', '.join(missing)})"
-        raise UserError(text, problem, "see popgen.play.policy.Policy")
-    if first.view not in env.spec.views:
-        raise UserError(text, f"wants the view {first.view!r}", f"choose among {', '.join(env.spec.views)}")
-    return make
+    except Exception as error:
+        problem = f"{name} cannot be found in the module {module} ({_describe_fault(error)})"
+        raise UserError(text, problem, "give module:Agent as Python would import it") from None
+    return found
+
+
+def _describe_fault(error: BaseException) -> str:
+    """Kind of an error in somebody else's code, and what it says, cut where that is long."""
+    said = str(error)
+    return shorten(f"{type(error).__name__}: {said}" if said else type(error).__name__, 300, placeholder="...")
 
 
 def _make_things(found: Any, spec: EnvSpec) -> Callable[[], Any]:

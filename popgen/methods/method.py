@@ -114,6 +114,14 @@ class Method:
     alone: int = 0
     trains_ego: bool = False
 
+    @property
+    def family(self) -> str:
+        """Package of the schema that its own is built on: methods of one family share a learner, and start from the
+        same weights at the same seed."""
+        schemas = [one for one in self.config.__mro__ if issubclass(one, RunConfig) and one is not RunConfig]
+        root = schemas[-1] if schemas else self.config
+        return root.__module__.rpartition(".")[0] or root.__module__
+
     def fit_size(self, least: int) -> int:
         """Members of the smallest population of whole groups that has at least so many."""
         groups = -(-max(0, least - self.alone) // self.multiple)

@@ -7,15 +7,17 @@ Keys of the JSON object (`holdout.json`); null stands for what is unknown:
     unit, episodes, seed     of scores; for each pair and seat; of the evaluation
     steps                    {"evaluation": N}
     egos, partners           groups: label, method, taught_by (methods), human, players (source, member, sha256,
-                             response: was a best response to it played)
-    standings                one for each ego and set of partners: ego, partners, count, mean, sd, se, interval,
-                             seat_0, seat_1 (where the ego sat), worst (score, ego, partner, seat), cvar_25,
-                             br_prox_iqm, br_prox_unclipped, normalised_return, regret
-    controls                 egos: ego, alone, beside random and idle; partners: alone, beside random and idle
-                             (mean, sd, se)
-    margins                  ego, control, partners, gain (value, low, high)
+                             identity, mate: number of the member that it was trained in a pair with or null, response:
+                             the best response to it that was played: source, scale, settings, steps; or null)
+    standings                one for each ego and set of partners: ego, partners, count, referenced (of these partners,
+                             with a reference), mean, sd, se, interval, seat_0, seat_1 (where the ego sat), worst
+                             (score, ego, partner, seat), cvar_25, br_prox_iqm and br_prox_unclipped (null without a
+                             partner that has a reference), normalised_return, regret
+    controls                 egos: ego, alone, mate, random, idle; partners: partner and the same (mean, sd, se); mate
+                             is null where none was trained in a pair
+    margins                  ego, control, partners, gain (value, low, high), resampled (for the interval)
     reference                best response known to each partner: partner, member, source, seat_0, seat_1, of
-                             (`self-play` or `best response`, by seat)
+                             (`best response`, `mate` or `self-play`, by seat)
     paper                    holdout, ego, mean, spread: the paper's table of the layout
     pairs                    ego, member, ego_source, partner, partner_member, partner_source (populations' folders or
                              module:Agent: one label may have several), seat (of the ego), mean, sd, se, scores
@@ -34,9 +36,17 @@ import numpy as np
 
 from popgen.errors import UserError
 from popgen.evaluation.holdout import CONTROLS, SEATS, HoldoutResult
-from popgen.evaluation.holdout_figures import Standing, describe_all, find_references, measure_margins
+from popgen.evaluation.holdout_figures import (
+    BEST_RESPONSE,
+    MATE,
+    Standing,
+    describe_all,
+    find_references,
+    list_references,
+    measure_margins,
+)
 from popgen.evaluation.holdout_metrics import describe_spread
-from popgen.evaluation.holdout_players import Group
+from popgen.evaluation.holdout_players import Group, Response, find_mates, list_distinct
 from popgen.jsonable import jsonable
 from popgen.reports.frames import to_csv
 from popgen.reports.paper_ego_figures import list_cells
@@ -67,7 +77,7 @@ def to_dict(result: HoldoutResult, control: str | None = None) -> dict[str, Any]
         "reference": list(_list_references(result)),
         "paper": [asdict(cell) for cell in list_cells(result.environment.name)],
         "pairs": list(_list_pairs(result)),
-        "notes": _write_notes(result),
+        "notes": [*_write_notes(result), *([_MARGINS] if control else [])],
     }
     return jsonable(report)
 
@@ -78,18 +88,26 @@ def _describe_group(result: HoldoutResult, group: Group) -> dict[str, Any]:
             "source": one.source,
             "member": one.member,
             "sha256": one.digest,
-            "response": (one.digest or "") in result.casting.responses,
+            "identity": one.identity,
+            "mate": None if mate == place else group.players[mate].member,
+            "response": _describe_response(result.casting.responses.get(one.identity or "")),
         }
-        for one in group.players
+        for place, (one, mate) in enumerate(zip(group.players, find_mates(group.players), strict=True))
     ]
     human = group.label in result.casting.humans
     taught = sorted(group.taught_by)
     return {"label": group.label, "method": group.method, "taught_by": taught, "human": human, "players": players}
 
 
+def _describe_response(one: Response | None) -> dict[str, Any] | None:
+    if one is None:
+        return None
+    return {"source": one.player.source, "scale": one.scale, "settings": dict(one.settings), "steps": one.steps}
+
+
 def _describe_standing(one: Standing) -> dict[str, Any]:
     return {
-        **{"ego": one.ego, "partners": one.partners, "count": one.count},
+        **{"ego": one.ego, "partners": one.partners, "count": one.count, "referenced": one.referenced},
         **{"mean": one.score.mean, "sd": one.score.sd, "se": one.score.se},
         "interval": {"low": one.interval.low, "high": one.interval.high},
         **{"seat_0": one.seats[0], "seat_1": one.seats[1]},
@@ -113,19 +131,28 @@ def _describe_controls(result: HoldoutResult) -> dict[str, Any]:
     for group in casting.egos:
         rows = casting.rows(group.label)
         beside = {name: _describe_scores(result.ego_beside[name][rows]) for name in CONTROLS}
-        egos.append({"ego": group.label, "alone": _describe_scores(result.ego_alone[rows]), **beside})
+        own = {"alone": _describe_scores(result.ego_alone[rows]), "mate": _describe_mates(result.ego_mates[rows])}
+        egos.append({"ego": group.label, **own, **beside})
     for group in casting.partners:
         columns = casting.columns([group.label])
         beside = {name: _describe_scores(result.partner_beside[name][columns]) for name in CONTROLS}
-        partners.append({"partner": group.label, "alone": _describe_scores(result.partner_alone[columns]), **beside})
+        mate = _describe_mates(result.partner_mates[columns])
+        own = {"alone": _describe_scores(result.partner_alone[columns]), "mate": mate}
+        partners.append({"partner": group.label, **own, **beside})
     return {"egos": egos, "partners": partners}
 
 
+def _describe_mates(scores: np.ndarray) -> dict[str, float] | None:
+    """Of those that have one; None where nobody has."""
+    known = scores[np.isfinite(scores)]
+    return _describe_scores(known) if known.size else None
+
+
 def _list_references(result: HoldoutResult) -> Iterator[dict[str, Any]]:
-    references, trained = find_references(result), result.responses.mean(-1)
+    references, kinds = find_references(result), list_references(result)
     for n, player in enumerate(result.casting.partner_players):
-        of = ["best response" if trained[n, seat] >= references[n, seat] else "self-play" for seat in SEATS]
         seats = {f"seat_{seat}": references[n, seat] for seat in SEATS}
+        of = [next(kind for kind, known in kinds.items() if known[n, seat] >= references[n, seat]) for seat in SEATS]
         yield {"partner": player.group, "member": player.member, "source": player.source, **seats, "of": of}
 
 
@@ -140,24 +167,59 @@ def _list_pairs(result: HoldoutResult) -> Iterator[dict[str, Any]]:
                 yield {**names, **where, **_describe_scores(scores), "scores": scores.tolist()}
 
 
+_MARGINS = (
+    "Intervals (95 %) of margins draw partners anew, and the seeds of the ego and of the control each on their own, "
+    "wherever there are several."
+)
+
+
 def _write_notes(result: HoldoutResult) -> list[str]:
-    casting, references = result.casting, find_references(result)
-    trained = int(np.isfinite(result.responses).all((1, 2)).sum())
-    total = len(casting.partner_players)
-    notes = [
-        "SD is over episodes, SE = SD / sqrt(episodes); intervals (95 %) are over an ego's seeds, or over partners "
-        "where it has one seed. Those over few seeds are too narrow.",
-        f"BR-Prox divides by the best response known: a trained one for {trained} of {total} partners, else the "
-        "partner with itself; where a trained one scores less than that, the partner with itself.",
+    return [
+        "SD is over episodes, SE = SD / sqrt(episodes); intervals (95 %) draw an ego's seeds anew and keep the "
+        "partners, or draw partners anew where it has one seed. Those over few seeds are too narrow.",
+        *_write_reference_notes(result),
+        *_write_response_notes(result),
+        *_write_origin_notes(result),
     ]
-    if useless := int((references <= 0.0).any(1).sum()):
-        notes.append(
-            f"{useless} of {total} partners scores nothing even so: there the clipped BR-Prox is 1 by definition."
-        )
+
+
+def _write_reference_notes(result: HoldoutResult) -> Iterator[str]:
+    """What BR-Prox divides by, of partners that are no copies of others."""
+    kept = list_distinct(result.casting.partner_players)
+    total, kinds, references = len(kept), list_references(result), find_references(result)[kept] > 0.0
+    counts = {kind: int(np.isfinite(kinds[kind][kept]).any(1).sum()) for kind in (BEST_RESPONSE, MATE)}
+    yield (
+        "BR-Prox divides by the best response known, whichever scores most: a trained one "
+        f"({counts[BEST_RESPONSE]} of {total} partners), the mate that it was trained in a pair with ({counts[MATE]}), "
+        "or the partner with itself."
+    )
+    for number, where in ((0, "in either seat"), (1, "in one of the seats")):
+        if useless := int((references.sum(1) == number).sum()):
+            yield f"{useless} of {total} partners have no reference that scores {where}: left out of BR-Prox there."
+
+
+def _write_response_notes(result: HoldoutResult) -> Iterator[str]:
+    """How the best responses were trained, each way once."""
+    casting = result.casting
+    used = {one.identity: casting.responses.get(one.identity or "") for one in casting.partner_players}
+    counts: dict[str, int] = {}
+    for one in used.values():
+        if one is not None:
+            settings = "".join(f", {name}={value}" for name, value in one.settings.items())
+            way = f"scale={one.scale}{settings}: {one.steps:,} steps"
+            counts[way] = counts.get(way, 0) + 1
+    yield from (f"Best responses ({count}) were trained with {way} each." for way, count in counts.items())
+
+
+def _write_origin_notes(result: HoldoutResult) -> Iterator[str]:
+    """Copies of one policy, and egos of which too little is known."""
+    casting = result.casting
+    for who, players in (("partners", casting.partner_players), ("players of egos", casting.ego_players)):
+        if copies := len(players) - len(list_distinct(players)):
+            yield f"{copies} of {len(players)} {who} are copies of others, which count once in a set."
     unknown = [group.label for group in casting.egos if not group.on_record]
     if unknown:
-        notes.append(f"What they were trained with is not on record: {', '.join(unknown)}.")
-    return notes
+        yield f"What they were trained with is not on record, or not in full: {', '.join(unknown)}."
 
 
 def to_csv_text(report: Mapping[str, Any]) -> str:
@@ -167,7 +229,7 @@ def to_csv_text(report: Mapping[str, Any]) -> str:
     for pair in report["pairs"]:
         best = known[pair["partner"], pair["partner_source"], pair["partner_member"]][f"seat_{pair['seat']}"]
         ratio = pair["mean"] / best if best and best > 0 else None
-        figures = {"reference": best, "br_prox": ratio, "br_prox_clipped": 1.0 if ratio is None else min(1.0, ratio)}
+        figures = {"reference": best, "br_prox": ratio, "br_prox_clipped": None if ratio is None else min(1.0, ratio)}
         more = {"ego_member": pair["member"], "episodes": report["episodes"], "regret": best - pair["mean"]}
         rows.append({**pair, **figures, **more})
     return to_csv(rows, CSV_FIELDS)

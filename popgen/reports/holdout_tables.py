@@ -89,16 +89,19 @@ def _make_relative_sheet(report: Mapping[str, Any]) -> Sheet:
 
 
 def _make_control_sheet(report: Mapping[str, Any]) -> Sheet:
-    cells = []
+    cells, mates = [], any(row["mate"] for rows in report["controls"].values() for row in rows)
     for kind, rows in (("ego", report["controls"]["egos"]), ("partner", report["controls"]["partners"])):
         for row in rows:
-            found = {name: {**row[key], "standard_error": row[key]["se"]} for name, key in _CONTROLS.items()}
-            figures = {name: estimate_text(figure) for name, figure in found.items()}
+            figures = {name: _show_control(row[key]) for name, key in _CONTROLS.items() if key != "mate" or mates}
             cells.append({"who": f"{kind} {title_of(row[kind])}", **figures})
     return Sheet("controls: mean ± SE", pd.DataFrame(cells))
 
 
-_CONTROLS = {"with itself": "alone", "beside random": "random", "beside idle": "idle"}
+def _show_control(figure: Mapping[str, float] | None) -> str:
+    return UNKNOWN if figure is None else estimate_text({"mean": figure["mean"], "standard_error": figure["se"]})
+
+
+_CONTROLS = {"with itself": "alone", "with its mate": "mate", "beside random": "random", "beside idle": "idle"}
 
 
 def _make_margin_sheet(report: Mapping[str, Any]) -> Sheet:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from popgen.evaluation.holdout_metrics import (
+    bootstrap_gain,
     bootstrap_interval,
     bootstrap_units,
     describe_spread,
@@ -30,9 +31,10 @@ def test_mean_sd_and_se_have_their_names() -> None:
 
 
 def test_br_prox_clipped_and_not() -> None:
-    assert measure_br_proximity(MEANS, BEST).tolist() == [[[0.5, 0.5], [1.0, 1.0]]]
-    unclipped = measure_br_proximity(MEANS, BEST, clip=False)
-    assert unclipped[0, 1, 0] == 1.5 and math.isnan(unclipped[0, 1, 1])
+    clipped, unclipped = measure_br_proximity(MEANS, BEST), measure_br_proximity(MEANS, BEST, clip=False)
+    np.testing.assert_array_equal(clipped, [[[0.5, 0.5], [1.0, math.nan]]])
+    np.testing.assert_array_equal(unclipped, [[[0.5, 0.5], [1.5, math.nan]]])
+    assert math.isnan(measure_br_proximity(MEANS - 9, BEST - 9)[0, 1, 1])  # nor a share of less than nothing
 
 
 def test_regret_and_normalised_return() -> None:
@@ -107,8 +109,44 @@ def test_one_run_has_no_interval_over_runs() -> None:
     assert bootstrap_interval(np.array([[1.0, 2.0, 3.0, 4.0]]), over_tasks=True).value == 2.5
 
 
+def test_a_gain_draws_the_seeds_of_both_sides_each_on_their_own() -> None:
+    """Seeds of 0 and 8 and a control of 5, at all partners: a quarter of the draws has two seeds of 0, a quarter two of
+    8. With a control of two seeds, 1 and 9, the extremes are 0 - 9 and 8 - 1, a sixteenth of the draws each."""
+    own = np.stack([np.zeros((6, 2)), np.full((6, 2), 8.0)])
+    one = bootstrap_gain(own, np.full((1, 6, 2), 5.0))
+    assert (one.value, one.low, one.high) == (-1.0, -5.0, 3.0)
+    swapped = bootstrap_gain(np.full((1, 6, 2), 5.0), own)
+    assert (swapped.value, swapped.low, swapped.high) == (1.0, -3.0, 5.0)
+    both = bootstrap_gain(own, np.stack([np.ones((6, 2)), np.full((6, 2), 9.0)]))
+    assert (both.value, both.low, both.high) == (-1.0, -9.0, 7.0)
+
+
+def test_a_gain_draws_the_partners_of_both_sides_together() -> None:
+    """Beside one partner 10 more, beside the other as much: a quarter of the draws is of one partner alone. What both
+    sides have in common, a partner with whom everybody scores 100 more, widens nothing."""
+    own, base = np.array([[[10.0, 10.0], [100.0, 100.0]]]), np.array([[[0.0, 0.0], [100.0, 100.0]]])
+    gain = bootstrap_gain(own, base)
+    assert (gain.value, gain.low, gain.high) == (5.0, 0.0, 10.0)
+    alone = bootstrap_gain(own[:, :1], base[:, :1])
+    assert alone.value == 10.0 and math.isnan(alone.low) and math.isnan(alone.high)
+    seats = bootstrap_gain(np.array([[[10.0, 0.0]]]), np.zeros((2, 1, 2)))  # of two seeds that are alike
+    assert (seats.value, seats.low, seats.high) == (5.0, 5.0, 5.0)
+
+
+def test_a_gain_of_one_seed_over_one_is_bootstrapped_over_partners_alone() -> None:
+    own, base = np.random.default_rng(3).normal(size=(2, 1, 7, 2))
+    of_units = bootstrap_units((own - base)[0], lambda drawn: float(drawn.mean()))
+    gain = bootstrap_gain(own, base)
+    for mine, theirs in ((gain.value, of_units.value), (gain.low, of_units.low), (gain.high, of_units.high)):
+        assert mine == pytest.approx(theirs)
+    assert gain == bootstrap_gain(own, base)
+
+
 def test_bad_arguments_are_refused() -> None:
     for call in (
+        lambda: bootstrap_gain(np.ones((2, 3, 2)), np.ones((2, 4, 2))),
+        lambda: bootstrap_gain(np.ones((0, 3, 2)), np.ones((2, 3, 2))),
+        lambda: bootstrap_gain(np.ones((3, 2)), np.ones((3, 2))),
         lambda: measure_cvar(np.ones(3), 0.0),
         lambda: measure_br_proximity(MEANS, BEST[:1]),
         lambda: bootstrap_interval(np.ones(4)),

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from importlib import invalidate_caches
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,14 @@ class Walker(Agent):
 class Odd(North):
     view = "nowhere"
 
+class Hidden(North):
+    @property
+    def view(self): raise LookupError("no view yet")
+
+class Viewless(North):
+    view = ["features"]
+
+def leave(): raise SystemExit(3)
 stay = StayAgent()
 def broken(): raise RuntimeError("no model here")
 number = 3
@@ -88,8 +97,12 @@ def test_an_agent_of_overcooked_ai_sees_its_seat_and_the_time() -> None:
     ("name", "told"),
     [
         ("nowhere_at_all:A", "cannot be imported"),
-        ("their_agents:missing", "cannot be imported"),
+        ("their_agents:missing", "missing cannot be found in the module their_agents .AttributeError: "),
+        ("their_agents:North.view.deeper", "cannot be found in the module"),
         ("their_agents:broken", "cannot be made .RuntimeError: no model here"),
+        ("their_agents:leave", "cannot be made .SystemExit: 3"),
+        ("their_agents:Hidden", "cannot be made .LookupError: no view yet"),
+        ("their_agents:Viewless", "wants the view .'features'."),
         ("their_agents:number", "neither a policy nor an agent"),
         ("their_agents:Odd", "wants the view 'nowhere'"),
     ],
@@ -97,6 +110,38 @@ def test_an_agent_of_overcooked_ai_sees_its_seat_and_the_time() -> None:
 def test_what_cannot_play_is_refused_in_one_line(name: str, told: str) -> None:
     with pytest.raises(UserError, match=told):
         open_user_agent(name, ENV)
+
+
+@pytest.mark.usefixtures("module")
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("class A:\n    def act(self: pass\n", "(SyntaxError: invalid syntax (faulty_agents.py, line 2))"),
+        ("class A:\npass\n", "IndentationError: expected an indented block after class definition on line 1"),
+        ("1 / 0\n", "ZeroDivisionError: division by zero"),
+        ("raise ValueError('two\\nlines')\n", "ValueError: two lines"),
+        ("import sys\nsys.exit('no licence')\n", "SystemExit: no licence"),
+        ("raise KeyError\n", "KeyError"),
+        ("x = '\x00'\n", "null bytes"),
+    ],
+)
+def test_a_module_that_cannot_be_run_is_named_in_one_line(text: str, told: str) -> None:
+    Path("faulty_agents.py").write_text(text)
+    invalidate_caches()
+    with pytest.raises(UserError) as caught:
+        open_user_agent("faulty_agents:A", ENV)
+    line = str(caught.value)
+    assert line.startswith("faulty_agents:A: the module faulty_agents fails when it is imported") and told in line
+    assert "python -c 'import faulty_agents'" in line and len(line.splitlines()) == 1
+    assert "faulty_agents" not in sys.modules
+
+
+@pytest.mark.usefixtures("module")
+def test_a_dependency_that_is_missing_is_named() -> None:
+    Path("needy_agents.py").write_text("import no_such_package\n")
+    invalidate_caches()
+    with pytest.raises(UserError, match="cannot be imported .No module named 'no_such_package'.; give module:Agent"):
+        open_user_agent("needy_agents:A", ENV)
 
 
 @pytest.mark.usefixtures("module")

@@ -27,6 +27,44 @@ def test_the_effective_rank_of_two_eigenvalues() -> None:
     assert diversity.effective_rank == pytest.approx(math.exp(-(values * np.log(values)).sum()), rel=1e-6)
 
 
+def test_dependent_partners_have_no_determinant_by_rounding_either() -> None:
+    """Seven partners and four events that occur: the eigenvalues of three directions are rounding noise, whose product
+    with the others would be a number like any."""
+    rng = np.random.default_rng(5)
+    events = np.zeros((7, 17))
+    events[:, [1, 4, 9, 12]] = rng.integers(1, 400, size=(7, 4)) / 40
+    found = measure_diversity(events)
+    assert (found.rank, found.determinant, found.log_determinant) == (4, 0.0, -math.inf)
+    assert 1.0 <= found.effective_rank <= 4.0
+    four = measure_diversity(events[:4])
+    assert four.rank == 4 and four.log_determinant == pytest.approx(np.linalg.slogdet(_gram(events[:4]))[1])
+    assert measure_diversity(np.zeros((3, 2))).rank == 0
+
+
+def test_near_collinear_partners_that_differ_keep_their_determinant() -> None:
+    """Rows (1, 1) and (1, 1 - 1e-5): the determinant is 1e-10, five orders above what counts as rounding."""
+    found = measure_diversity(np.array([[1e6, 1e6], [1e6, 1e6 - 10]]))
+    assert found.rank == 2 and found.determinant == pytest.approx(1e-10, rel=1e-4)
+
+
+def _gram(events: np.ndarray) -> np.ndarray:
+    scaled = events / (events.max(0) + 1e-3)
+    return scaled @ scaled.T
+
+
+@pytest.mark.parametrize("limit", [10**9, 0])
+def test_of_more_than_are_independent_those_of_the_largest_volume_are_chosen(
+    monkeypatch: pytest.MonkeyPatch, limit: int
+) -> None:
+    """Three of rank two. Rows (1, 0), (.9, .1), (0, 1), (1, 0) again: by Cauchy and Binet the product of the two
+    eigenvalues of three rows is the sum of the squares of their three determinants: of rows 1, 3, 4 it is 0 + 1 + 1, of
+    2, 3, 4 .81 + 1 + .01, of 1, 2, 3 the same and of 1, 2, 4 .02."""
+    monkeypatch.setattr(event_diversity, "EXHAUSTIVE", limit)
+    events = 1e6 * np.array([[1.0, 0.0], [0.9, 0.1], [0.0, 1.0], [1.0, 0.0]])
+    assert choose_most_diverse(events, 3) == [0, 2, 3]
+    assert choose_most_diverse(np.zeros((4, 3)), 2) == [0, 1]
+
+
 @pytest.mark.parametrize("limit", [10**9, 0])
 def test_the_most_diverse_are_found_with_and_without_trying_all(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
     events = np.abs(np.random.default_rng(3).normal(size=(9, 6)))
