@@ -92,8 +92,11 @@ def _measure_run(pieces: Pieces, job: Job, name: str) -> None:
         raise UserError(name, f"needs {missing[0]}", "finish that run first")
     episodes, people = pieces.plan.budget.episodes, _gather_study(pieces, job)
     humans, search = pieces.plan.out / "humans", pieces.plan.budget.proxy
-    figures = MEASURES[name](RunToMeasure(job.folder, job.wanted.row, episodes, holdouts, people, humans, search))
+    common = pieces.find_common_size(job)
+    work = RunToMeasure(job.folder, job.wanted.row, episodes, holdouts, people, humans, search, common)
+    figures = MEASURES[name](work)
     values = {"run": str(job.folder), "episodes": episodes, "figures": round_figures(jsonable(figures))}
+    values["definition"] = pieces.define_measure(job, name)
     write_json(pieces.find_measured(job, name), values)
 
 
@@ -180,5 +183,6 @@ def _describe_run(pieces: Pieces, run: WantedRun, job: Job) -> dict[str, Any]:
         "machine": piece.get("machine") or last.get("machine"),
         "taken_over": job.taken_over,
         "seconds": describe_seconds(record),
+        "definitions": {name: pieces.define_measure(job, name) for name in run.measures},
         "figures": {name: pieces.read_measured(job, name) for name in run.measures},
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from popgen.config.run_config import RunConfig, field_names
 from popgen.durable_files import replace_file
 from popgen.methods.registry import METHODS, recipe
 from popgen.pipelines.run_batch import named
+from popgen.reports.reproduction.measure_definitions import COMPARED, FIRST, define_measure
 from popgen.reports.reproduction.target_records import Budget, Record, Target, WantedRun, WantedStudy
 from popgen.reports.run_record import differences, is_finished, planned_run, read_run
 
@@ -181,14 +182,21 @@ class Pieces:
         return [list(run.words), _describe_run(config), *given]
 
     def _find_recorded(self, target: Target) -> dict[WantedRun, dict[str, Any]]:
-        """Entries of earlier records of the same budget, by the run of today that they stand for."""
+        """Entries of earlier records of the same budget, by the run of today that they stand for; without figures whose
+        meaning has changed. One that then lacks some counts where nothing is trained, but not in a new run's place."""
         budget = (target.name, self.plan.budget.name, self.plan.budget.episodes)
         same = [one for one in self.plan.records if (one["target"], one["budget"], one["episodes"]) == budget]
         entries = {(run["row"], run.get("settings_digest")): run for one in same for run in one["runs"]}
         if not entries:
             return {}
-        found = {run: entries.get((run.row, self.digest_settings(run))) for run in self.wanted[target.name]}
-        return {run: one for run, one in found.items() if one is not None and set(run.measures) <= set(one["figures"])}
+        found = {}
+        for run in self.wanted[target.name]:
+            told = entries.get((run.row, self.digest_settings(run)))
+            today = {name: self.define_measure(self.find_job(run), name) for name in run.measures}
+            figures = {} if told is None else _keep_comparable(told, today)
+            if told is not None and figures and (len(figures) == len(run.measures) or not self.plan.trains):
+                found[run] = {**told, "figures": figures}
+        return found
 
     def find_recorded(self, target: Target, run: WantedRun) -> dict[str, Any] | None:
         """What an earlier record tells of a run; None where none does, or the run is here."""
@@ -196,8 +204,16 @@ class Pieces:
 
     # What is there
 
+    def find_common_size(self, job: Job) -> int:
+        """Members of the smallest population that a job's is compared with, 0 where there is none."""
+        return _find_common_size(job, self.jobs.values())
+
+    def define_measure(self, job: Job, name: str) -> str:
+        """What a measure of a job means; see `popgen.reports.reproduction.measure_definitions`."""
+        return define_measure(name, job.config.method if job.config else "", self.find_common_size(job))
+
     def is_measured(self, job: Job, name: str) -> bool:
-        """A measure was made with as many episodes."""
+        """A measure of today's meaning was made with as many episodes."""
         return self.read_measured(job, name) is not None
 
     def find_measured(self, job: Job, name: str) -> Path:
@@ -205,9 +221,11 @@ class Pieces:
         return self.plan.out / "measured" / f"{job.folder.name}.{name}.json"
 
     def read_measured(self, job: Job, name: str) -> dict[str, Any] | None:
-        """Its figures; None where it is not there, or was made with other episodes or of another folder."""
+        """Its figures; None where it is not there, has another meaning, or was made with other episodes or of another
+        folder."""
         values = read_json(self.find_measured(job, name))
-        same = values.get("episodes") == self.plan.budget.episodes and values.get("run") == str(job.folder)
+        found = [values.get("episodes"), values.get("run"), values.get("definition", FIRST)]
+        same = found == [self.plan.budget.episodes, str(job.folder), self.define_measure(job, name)]
         return values["figures"] if same else None
 
     def count_pieces(self, target: Target) -> dict[str, int]:
@@ -275,6 +293,19 @@ class Pieces:
     def list_failures(self) -> list[str]:
         """Why pieces are not there, after an attempt."""
         return [f"{job.wanted.row}, seed {job.wanted.seed}: {job.failed}" for job in self.jobs.values() if job.failed]
+
+
+def _keep_comparable(told: Mapping[str, Any], today: Mapping[str, str]) -> dict[str, Any]:
+    """Figures of a record's entry, those of measures whose meaning is today's."""
+    known = dict.fromkeys(told["figures"], FIRST) | told.get("definitions", {})
+    return {name: figures for name, figures in told["figures"].items() if today.get(name) == known[name]}
+
+
+def _find_common_size(job: Job, jobs: Iterable[Job]) -> int:
+    """The smallest population in a job's environment of which something is measured that depends on it."""
+    every = [one.config for one in jobs if not set(COMPARED).isdisjoint(one.measures)]
+    same = [one for one in every if one is not None and job.config is not None and one.env == job.config.env]
+    return min((one.population.size for one in same), default=0)
 
 
 def _describe_run(config: RunConfig) -> list[Any]:

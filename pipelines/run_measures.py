@@ -1,10 +1,14 @@
-"""What `popgen reproduce` measures of a finished run: name -> small figures for its record."""
+"""What `popgen reproduce` measures of a finished run: name -> small figures for its record.
+
+Where the meaning of a measure changes, `popgen.reports.reproduction.measure_definitions` gets a new number.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,8 @@ from popgen.evaluation.convention_effects import tabulate_effects
 from popgen.evaluation.crossplay import IDLE, RANDOM
 from popgen.evaluation.held_members import hold_members
 from popgen.evaluation.holdout import Casting, evaluate_holdout
-from popgen.evaluation.holdout_players import check_disjoint, open_sides
+from popgen.evaluation.holdout_overlap import check_disjoint
+from popgen.evaluation.holdout_players import open_sides
 from popgen.evaluation.partner_diversity import measure_partners
 from popgen.evaluation.played_games import PlayedGame, count_members, count_people
 from popgen.humans.proxies import ProxySearch, fit_missing_population
@@ -27,12 +32,14 @@ from popgen.humans.recordings import LAYOUTS, load_games
 from popgen.pipelines.compare import HELD_SEED
 from popgen.pipelines.experiments import describe_population, measure_source, open_sources
 from popgen.pipelines.simulated_study import CONVENTION_SPREAD, StudyToSimulate, play_study
+from popgen.play import event_diversity
 from popgen.population import load_population
 from popgen.reports.comparison import default_thresholds, quality_costs
+from popgen.reports.crossplay_report import list_own_scores
 from popgen.reports.holdout_report import to_dict
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_record import MemberRecord, RunRecord, read_run
-from popgen.types import FINAL_SKILL, Kind
+from popgen.types import FINAL_SKILL, SKILLS, Kind
 
 SEED = 0
 """Of evaluations; that of held ones is HELD_SEED."""
@@ -42,6 +49,9 @@ GRID = 21
 
 SHARE = 0.8
 """Of the final score, at which a curve has risen."""
+
+SUBSETS = 5_000
+"""Sets of members that BR-Div is averaged over at most; of more of them so many are drawn."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,7 @@ class RunToMeasure:
         people: the study in which simulated people play with the ego.
         humans: folder of human proxies, which are fitted there once.
         proxy: of the search for one, as the budget says.
+        common: members of the smallest population that it is compared with, 0 where it is compared with none.
     """
 
     folder: Path
@@ -65,12 +76,14 @@ class RunToMeasure:
     people: StudyToSimulate | None = None
     humans: Path = Path("humans")
     proxy: Mapping[str, int] = field(default_factory=dict)
+    common: int = 0
 
 
 def measure_scores(job: RunToMeasure) -> dict[str, Any]:
-    """Of the run's own evaluation: SP, XP, beside random and idle, what remains after cross-play, obstruction."""
+    """Of the run's own evaluation: SP, XP, beside random and idle, what remains after cross-play, obstruction; and its
+    episodes for each pair."""
     scores = read_run(job.folder).scores
-    found = {name: scores[name]["mean"] for name in ("sp", "xp")}
+    found = {"episodes": scores["episodes"], **{name: scores[name]["mean"] for name in ("sp", "xp")}}
     found |= {partner: scores["beside"][partner]["both"]["mean"] for partner in (RANDOM, IDLE)}
     members = scores.get("mixed_play", {}).get("members", [])
     shares = [one[seat]["kept"]["mean"] for one in members for seat in ("seat_0", "seat_1")]
@@ -100,16 +113,17 @@ def measure_costs(job: RunToMeasure) -> dict[str, Any]:
 
 def measure_curves(job: RunToMeasure) -> dict[str, Any]:
     """Real self-play in training: the mean of later members against own and simulated steps; where that is first at
-    SHARE of the later members' score in the run's evaluation."""
+    SHARE of the later members' score in the run's evaluation; and the episodes of that for each pair."""
     run = read_run(job.folder)
     later = run.members[1:]
-    table = run.scores["matrix"]["mean"]
+    own = [score for score in list(list_own_scores(run.scores).values())[1:] if score is not None]
     found: dict[str, Any] = {
+        "episodes": run.scores["episodes"],
         "later": _average_curve(later, simulated=False),
         "later_simulated": _average_curve(later, simulated=True),
     }
-    if later:
-        found["final"] = float(np.mean([table[row][row] for row in range(1, len(run.members))]))
+    if own:
+        found["final"] = float(np.mean(own))
         for name, curve in (("reached", found["later"]), ("reached_simulated", found["later_simulated"])):
             above = [steps for steps, score in curve if score >= SHARE * found["final"]]
             found |= {name: above[0]} if above and found["final"] > 0 else {}
@@ -129,10 +143,12 @@ def _average_curve(members: Sequence[MemberRecord], *, simulated: bool) -> list[
 
 
 def measure_first(job: RunToMeasure) -> dict[str, Any]:
-    """Of the first member alone: real self-play in training, its score in the run's evaluation, steps and minutes."""
+    """Of the first member alone: real self-play in training, its score in the run's evaluation and the episodes of that
+    for each pair, steps and minutes."""
     run = read_run(job.folder)
-    member = run.members[0]
-    found: dict[str, Any] = {"final": run.scores["matrix"]["mean"][0][0], "steps": member.real}
+    member, scores = run.members[0], run.scores
+    final = list_own_scores(scores)[member.member]
+    found: dict[str, Any] = {"final": final, "episodes": scores["episodes"], "steps": member.real}
     if curve := _average_curve([member], simulated=False):
         found["curve"] = curve
     return found | ({} if member.seconds is None else {"minutes": member.seconds / 60})
@@ -168,7 +184,8 @@ def measure_exits(job: RunToMeasure) -> dict[str, Any]:
 
 
 def measure_diversity(job: RunToMeasure) -> dict[str, Any]:
-    """BR-Div over the members' events in play with themselves."""
+    """BR-Div over the members' events in play with themselves, or with their mates where they were trained in pairs:
+    of as many members as the smallest population that is compared has, the mean over all sets of so many."""
     opened = open_sides({"partner": [(None, str(job.folder))]}, title_of)
     players = [player for group in opened.sides["partner"] for player in group.players]
     name, params = opened.environment.name, opened.environment.params
@@ -176,25 +193,52 @@ def measure_diversity(job: RunToMeasure) -> dict[str, Any]:
     def make(num_envs: int, seed: int) -> Any:
         return make_env(name, num_envs, seed=seed, **params)
 
-    found = measure_partners(make, players, None, job.episodes, SEED).diversity
-    log = found.log_determinant
-    return {"effective_rank": found.effective_rank, **({"log_determinant": log} if math.isfinite(log) else {})}
+    size = min(job.common or len(players), len(players))
+    sets = measure_subsets(measure_partners(make, players, None, job.episodes, SEED).kinds, size)
+    rank, log = (float(np.mean([getattr(one, name) for one in sets])) for name in ("effective_rank", "log_determinant"))
+    figures = {"members": len(players), "of": size, "effective_rank": rank}
+    return figures | ({"log_determinant": log} if math.isfinite(log) else {})
+
+
+def measure_subsets(counts: np.ndarray, size: int) -> list[event_diversity.Diversity]:
+    """BR-Div of every set of `size` of some members, each set on its own; of SUBSETS drawn ones of more.
+
+    Args:
+        counts: (K, F) mean counts of an episode.
+        size: at most K.
+    """
+    members = len(counts)
+    if math.comb(members, size) <= SUBSETS:
+        chosen = [list(rows) for rows in itertools.combinations(range(members), size)]
+    else:
+        rng = np.random.default_rng(SEED)
+        chosen = [sorted(rng.choice(members, size, replace=False).tolist()) for _ in range(SUBSETS)]
+    return [event_diversity.measure_diversity(counts[rows]) for rows in chosen]
 
 
 def measure_acting(job: RunToMeasure) -> dict[str, Any]:
-    """How differently the members act (see `popgen.evaluation.action_diversity`), those of full skill where there are
-    several; nothing where they cannot tell their probabilities."""
+    """How differently the members act (see `popgen.evaluation.action_diversity`); of members of several skills those
+    whose training went to its end.
+
+    Nothing where they cannot tell their probabilities. Where there are fewer of full skill than the smallest population
+    has members, it is told how many there are and how many it takes.
+    """
     opened = open_sides({"partner": [(None, str(job.folder))]}, title_of)
     name, params = opened.environment.name, opened.environment.params
+    (group,) = opened.sides["partner"]
+    if any(player.part in SKILLS for player in group.players):
+        group = replace(group, players=tuple(player for player in group.players if player.part == FINAL_SKILL))
+        if len(group.players) < max(2, job.common):
+            return {"finals": len(group.players), "needed": max(2, job.common)}
 
     def make(num_envs: int, seed: int) -> Any:
         return make_env(name, num_envs, seed=seed, **params)
 
-    measured = {one.part: one.found for one in measure_groups(make, opened.sides["partner"], job.episodes, SEED)}
+    measured = {one.part: one.found for one in measure_groups(make, [group], job.episodes, SEED)}
     if not measured:
         return {}
-    found = measured[FINAL_SKILL if FINAL_SKILL in measured else "all"]
-    figures = {"members": found.members}
+    found = measured["all"]
+    figures: dict[str, Any] = {"members": found.members} | ({"share": found.share.value} if found.share else {})
     for name, interval in (("entropy", found.entropy), ("trajectories", found.trajectories)):
         figures |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return figures

@@ -23,8 +23,8 @@ def add(commands: Any) -> None:
         "People are those whose games overcooked-ai installs, or those of --records, each ego's apart. "
         "A player in a game is in the high (low) group of a "
         "behaviour if its rate lies so many standard deviations above (below) the mean of its layout and seat; the "
-        "last column pools layouts and seats as the paper does. Members play with themselves. Keys of "
-        "--json: players (label, games, within, pooled, coverage), files.",
+        "last column pools layouts and seats as the paper does. Members play with themselves, those of pairs with "
+        "their mates. Keys of --json: players (label, games, within, pooled, coverage), files.",
     )
     parser.add_argument("populations", nargs="*", type=named_path, metavar="[NAME=]POPULATION", help="beside people")
     parser.add_argument("--layout", action="append", metavar="NAME", help="of people; may be repeated; all by default")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from popgen.cli.arguments import add_command, at_least, named_path, share_of_one
+from popgen.cli.arguments import add_command, at_least, named_path, pair, share_of_one
 from popgen.cli.printing import OK, print_json, print_report
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
@@ -19,16 +19,25 @@ def add(commands: Any) -> None:
         "diversity",
         measure,
         "BR-Div of partners (determinant, its logarithm, effective rank), the most diverse K, how differently they act",
-        "Over the events of the partners in play with themselves, and of their best responses beside them where all "
-        "have one (popgen evaluate --best-responses trains them). Then, for each population, the entropy of its mean "
-        "policy and the divergence of its members' trajectories. Keys of --json: those of "
-        "popgen/reports/diversity_report.py and files.",
+        "Over the events of the partners in play with themselves (of pairs with their mates), and of their best "
+        "responses beside them where all have one (popgen evaluate --best-responses trains them). Then, for each "
+        "population, the entropy of its mean policy and the divergence of its members' trajectories. Keys of --json: "
+        "those of popgen/reports/diversity_report.py and files.",
     )
     parser.add_argument(
         *("populations",), metavar="[NAME=]POPULATION", nargs="+", type=named_path, help="partners, of one environment"
     )
     parser.add_argument("--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them")
     parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
+    parser.add_argument(
+        *("--response-set",),
+        nargs="+",
+        action="extend",
+        type=pair,
+        default=[],
+        metavar="KEY=VALUE",
+        help="settings that they were trained with, such as scale=demo",
+    )
     parser.add_argument("--episodes", type=at_least(2), default=20, help="for each partner and seat (%(default)s)")
     parser.add_argument(
         "--kernel", type=share_of_one, default=0.5, help="TrajeDi's: 0 compares actions, 1 episodes (%(default)s)"
@@ -44,7 +53,7 @@ def measure(args: argparse.Namespace) -> int:
     from popgen.evaluation.action_diversity import measure_groups
     from popgen.evaluation.holdout_players import open_sides
     from popgen.evaluation.partner_diversity import measure_partners
-    from popgen.pipelines.best_responses import find_responses
+    from popgen.pipelines.best_responses import ResponseTraining, find_responses
     from popgen.reports.diversity_report import describe_diversity, list_lines, list_sheets, write_report
     from popgen.reports.method_titles import title_of
     from popgen.runs.preflight import check_root
@@ -55,9 +64,10 @@ def measure(args: argparse.Namespace) -> int:
     if args.choose is not None and args.choose > len(players):
         raise UserError("--choose", f"is {args.choose}, there are {len(players)} partners", "choose fewer")
     check_root(Path(args.out), 16 * 2**20, "--out")
-    found = find_responses(groups, args.responses)
-    responses = [found[player.digest or ""] for player in players if (player.digest or "") in found]
-    environment = opened.environment
+    environment, settings = opened.environment, dict(args.response_set)
+    training = ResponseTraining(str(settings.pop("scale", "laptop")), settings)
+    found = find_responses(groups, args.responses, training, environment)
+    responses = [found[player.identity or ""].player for player in players if (player.identity or "") in found]
 
     def make(num_envs: int, seed: int) -> Any:
         return make_env(environment.name, num_envs, seed=seed, **environment.params)
@@ -68,7 +78,10 @@ def measure(args: argparse.Namespace) -> int:
         measured["best responses"] = over
     acting = measure_groups(make, groups, args.episodes, args.seed, kernel=args.kernel)
     report = describe_diversity(
-        *(environment, args.episodes, args.seed, measured, len(responses)), actions=acting, kernel=args.kernel
+        *(environment, args.episodes, args.seed, measured, len(responses)),
+        actions=acting,
+        kernel=args.kernel,
+        training={"scale": training.scale, "settings": training.settings},
     )
     files = write_report(report, args.out)
     if args.json:

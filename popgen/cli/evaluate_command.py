@@ -33,6 +33,7 @@ def add(commands: Any) -> None:
         "evaluate",
         evaluate,
         "SP/XP matrix of a population, or egos beside hold-out partners (--with)",
+        "Of members that were trained in pairs SP is play with the mate and XP across pairs. "
         "Keys of --json: files, and those of popgen/reports/crossplay_report.py (sp, xp, matrix, beside, obstruction, "
         "pairs, ...) or, with --with, of popgen/reports/holdout_report.py (standings, controls, margins, pairs, ...).",
     )
@@ -155,7 +156,7 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     out = Path(args.out or "holdout")
     check_root(out, 64 * 2**20, "--out")
     with closing(make_reporter(quiet=args.quiet)) as reporter:
-        casting = _train_responses(casting, args, reporter)
+        casting = _train_responses(casting, environment, args, reporter)
         reporter.phase("evaluation", 1)
         result = evaluate_holdout(
             casting,
@@ -174,21 +175,29 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     return OK
 
 
-def _train_responses(casting: Casting, args: argparse.Namespace, reporter: Reporter) -> Casting:
+def _train_responses(
+    casting: Casting, environment: EnvironmentInfo, args: argparse.Namespace, reporter: Reporter
+) -> Casting:
     """The same players with the best responses to the partners, trained first where that is asked for."""
-    from popgen.pipelines.best_responses import find_responses, train_responses
+    from popgen.pipelines.best_responses import ResponseTraining, count_others, find_responses, train_responses
 
     settings = dict(args.response_set)
+    training = ResponseTraining(str(settings.pop("scale", "laptop")), settings)
+    where = (casting.partners, args.responses, training, environment)
     if args.best_responses:
-        scale = str(settings.pop("scale", "laptop"))
-        train_responses(casting.partners, args.responses, settings, reporter, scale=scale)
-    return replace(casting, responses=find_responses(casting.partners, args.responses))
+        train_responses(*where, reporter)
+    responses = find_responses(*where)
+    if not responses and (others := count_others(*where)):
+        told = f"{others} best responses lie there that were trained with other settings, and are not taken"
+        reporter.note(f"{told}: name these settings (--best-responses --response-set KEY=VALUE)")
+    return replace(casting, responses=responses)
 
 
 def _cast_players(args: argparse.Namespace) -> tuple[Casting, EnvironmentInfo]:
     """Egos and partners with nothing in common, in one environment."""
     from popgen.evaluation.holdout import Casting
-    from popgen.evaluation.holdout_players import check_disjoint, open_sides
+    from popgen.evaluation.holdout_overlap import check_disjoint
+    from popgen.evaluation.holdout_players import open_sides
     from popgen.reports.method_titles import title_of
 
     wanted = {"ego": args.populations, "partner": args.partners or [], "human": args.human or []}

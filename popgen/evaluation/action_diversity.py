@@ -1,12 +1,16 @@
 """How differently the members of a population act in the same situations: what MEP and TrajeDi pay members for.
 
-Each member plays with itself, and every member says with what probability it would take each action there. All figures
-are in nats and means over the members' own games, with a bootstrap over members and their games:
+Each member plays with itself, or with its mate where it was trained in a pair, half of its games in each seat; and
+every member says with what probability it would take each action there. All figures are in nats and means over the
+members' own games, with a bootstrap over members and their games:
 
     entropy      H(mean_k pi_k), of one seat's action: the population entropy of MEP (Zhao et al. 2023)
     own entropy  mean_k H(pi_k): what is left of it where all members are one
     actions      their difference, the Jensen-Shannon divergence of actions
     trajectories JSD_gamma of joint trajectories (Lupu et al. 2021), between 0 and ln K
+
+In the seat of a member's mate the others' mates answer: a joint trajectory is as probable under a member as under it
+and its mate together. Entropies are of the members' own seats alone.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv
 from popgen.evaluation.holdout_metrics import Interval, bootstrap_interval
-from popgen.evaluation.holdout_players import Group, Player
+from popgen.evaluation.holdout_players import Group, Player, find_mates
 from popgen.losses.population_diversity import trajectory_divergence
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play
@@ -40,6 +44,8 @@ class ActionDiversity:
         entropy, own_entropy, actions, trajectories: in nats.
         most: ln K, the largest divergence there is.
         steps: environment steps taken.
+
+    A divergence says more of few members than of many: compare populations of different size by its `share`.
     """
 
     members: int
@@ -49,6 +55,15 @@ class ActionDiversity:
     trajectories: Interval
     most: float
     steps: int
+
+    @property
+    def share(self) -> Interval | None:
+        """Divergence of trajectories as a part of ln K, between 0 and 1; None for one member."""
+        if not self.most:
+            return None
+        return Interval(
+            *(end / self.most for end in (self.trajectories.value, self.trajectories.low, self.trajectories.high))
+        )
 
 
 @dataclass(frozen=True)
@@ -66,14 +81,30 @@ class MeasuredActions:
     found: ActionDiversity
 
 
-class _Answers:
-    """What each of K networks would do at every step that others play; they keep a memory of it."""
+@dataclass(frozen=True)
+class _Network:
+    """What a policy would do, as a network with so large a memory, seen through a view."""
 
-    def __init__(self, networks: Sequence[nn.Module], sizes: Sequence[int], views: Sequence[str], env: BatchedEnv):
+    run: nn.Module
+    memory: int
+    view: str
+
+
+class _Answers:
+    """What each of K members would do at every step that others play; they keep a memory of it.
+
+    Args:
+        networks: of the members, and after them of mates that are no members.
+        mates: (K,) whose network answers for a member in its mate's seat.
+        own: (B, P) bool, the seat is that of the member whose game it is.
+        env: that they are asked in.
+    """
+
+    def __init__(self, networks: Sequence[_Network], mates: Sequence[int], own: np.ndarray, env: BatchedEnv) -> None:
         players, batch = env.spec.num_players, env.num_envs
-        self.env, self.networks, self.views = env, networks, views
+        self.env, self.networks, self.mates, self.own = env, networks, list(mates), torch.from_numpy(own)
         self.seat = torch.arange(players).repeat(batch)
-        self.memory = [torch.zeros(batch * players, size) for size in sizes]
+        self.memory = [torch.zeros(batch * players, network.memory) for network in networks]
         self.previous = torch.zeros(batch, players, dtype=torch.int64)
         self.chosen: list[Tensor] = []
         self.entropy: list[Tensor] = []
@@ -85,23 +116,28 @@ class _Answers:
         players = self.previous.shape[1]
         obs = {
             view: torch.from_numpy(self.env.encode(step.states, view)).repeat_interleave(players, 0)
-            for view in set(self.views)
+            for view in {network.view for network in self.networks}
         }
         first = torch.from_numpy(step.is_first).repeat_interleave(players)
         previous = self.previous.repeat_interleave(players, 0)
         rows = []
         for k, network in enumerate(self.networks):
-            logits, self.memory[k] = network(self.memory[k], obs[self.views[k]], previous, first, self.seat)
+            logits, self.memory[k] = network.run(self.memory[k], obs[network.view], previous, first, self.seat)
             rows.append(torch.log_softmax(logits, -1))
-        log_probs = torch.stack(rows)
+        every = torch.stack(rows)
+        log_probs = torch.where(self.own.reshape(1, -1, 1), every[: len(self.mates)], every[self.mates])
         self.previous = torch.from_numpy(step.actions.astype(np.int64))
-        taken = self.previous.reshape(-1, 1).expand(len(rows), -1, 1)
+        taken = self.previous.reshape(-1, 1).expand(len(log_probs), -1, 1)
         joint = log_probs.gather(-1, taken).squeeze(-1).unflatten(-1, (-1, players)).sum(-1)
-        mean = torch.logsumexp(log_probs, 0) - math.log(len(rows))
+        mean = torch.logsumexp(log_probs, 0) - math.log(len(log_probs))
         self.chosen.append(joint)
-        self.entropy.append(_entropy(mean).unflatten(0, (-1, players)).mean(-1))
-        self.own_entropy.append(_entropy(log_probs).mean(0).unflatten(0, (-1, players)).mean(-1))
+        self.entropy.append(self._average_own(_entropy(mean)))
+        self.own_entropy.append(self._average_own(_entropy(log_probs).mean(0)))
         self.counted.append(step.counted)
+
+    def _average_own(self, values: Tensor) -> Tensor:
+        """(B,) means over own seats of (B * P,) values."""
+        return (values.reshape(self.own.shape) * self.own).sum(-1) / self.own.sum(-1)
 
 
 def _entropy(log_probs: Tensor) -> Tensor:
@@ -116,40 +152,55 @@ def measure_actions(
     seed: int,
     *,
     kernel: float = KERNEL,
+    mates: Sequence[int] | None = None,
 ) -> ActionDiversity | None:
     """How differently some policies act; None where one of them cannot tell its probabilities.
 
     Args:
         make: (num_envs, seed) -> environment.
-        policies: K of them, one population's or what is to be seen as one.
-        episodes: N of each with itself, at least 2.
+        policies: K of them, one population's or what is to be seen as one; after them mates that are not of these.
+        episodes: N of each with its mate or itself, at least 2.
         seed: same arguments, same result.
         kernel: TrajeDi's gamma, in [0, 1]: 0 compares single actions, 1 whole episodes.
+        mates: (K,) place of each one's mate among the policies, its own where it has none; None where nobody has one.
     """
-    networks, sizes = [], []
-    for policy in policies:
-        network = policy.seat_network() if isinstance(policy, Stackable) else None
-        if network is None or not isinstance(policy, Stackable):
-            return None
-        networks.append(network)
-        sizes.append(policy.memory_size)
-    env = make(len(policies) * episodes, 0)
-    answers = _Answers(networks, sizes, [policy.view for policy in policies], env)
-    seats = np.repeat(np.arange(len(policies)), episodes)[:, None].repeat(env.spec.num_players, 1)
+    networks = [_find_network(policy) for policy in policies]
+    known = [network for network in networks if network is not None]
+    if len(known) < len(networks):
+        return None
+    mates = range(len(policies)) if mates is None else mates
+    env = make(len(mates) * episodes, 0)
+    seats, own = _seat_members(mates, episodes, env.spec.num_players)
+    answers = _Answers(known, mates, own, env)
     played = play(env, list(policies), seats, seed=seed, record=answers)
     counted = torch.from_numpy(np.stack(answers.counted))
     entropy = _mean_of_games(torch.stack(answers.entropy), counted, episodes)
     own = _mean_of_games(torch.stack(answers.own_entropy), counted, episodes)
     divergence = _mean_of_games(_diverge(torch.stack(answers.chosen, 1), counted, episodes, kernel), counted, episodes)
     return ActionDiversity(
-        members=len(policies),
+        members=len(mates),
         entropy=_estimate_interval(entropy),
         own_entropy=_estimate_interval(own),
         actions=_estimate_interval(entropy - own),
         trajectories=_estimate_interval(divergence),
-        most=math.log(len(policies)),
+        most=math.log(len(mates)),
         steps=played.steps,
     )
+
+
+def _find_network(policy: Policy) -> _Network | None:
+    network = policy.seat_network() if isinstance(policy, Stackable) else None
+    if network is None or not isinstance(policy, Stackable):
+        return None
+    return _Network(network, policy.memory_size, policy.view)
+
+
+def _seat_members(mates: Sequence[int], episodes: int, players: int) -> tuple[np.ndarray, np.ndarray]:
+    """(K * N, P) who sits where, and bool whose game it is: a member beside its mate in one seat, then in the other."""
+    member = np.repeat(np.arange(len(mates)), episodes)
+    own = np.arange(players) == np.arange(len(member))[:, None] % players
+    own |= (np.array(mates)[member] == member)[:, None]
+    return np.where(own, member[:, None], np.array(mates)[member][:, None]), own
 
 
 def measure_groups(
@@ -157,15 +208,28 @@ def measure_groups(
 ) -> list[MeasuredActions]:
     """Each population as a whole and, where its members have skills or roles, those of one; see `measure_actions`.
 
+    Members that were trained in pairs play with their mates, also where these have another role.
+
     Populations whose members cannot tell their probabilities are left out.
     """
     measured = []
     for group in groups:
         for part, players in _list_parts(group).items():
-            found = measure_actions(make, [player.make() for player in players], episodes, seed, kernel=kernel)
+            everybody, mates = _add_mates(group, players)
+            policies = [player.make() for player in everybody]
+            found = measure_actions(make, policies, episodes, seed, kernel=kernel, mates=mates)
             if found is not None:
                 measured.append(MeasuredActions(group.label, part, found))
     return measured
+
+
+def _add_mates(group: Group, players: Sequence[Player]) -> tuple[list[Player], list[int]]:
+    """Players and after them those of their mates that are not of them; the place of each one's mate."""
+    mate_of = {id(group.players[n]): group.players[mate] for n, mate in enumerate(find_mates(group.players))}
+    mates = [mate_of[id(player)] for player in players]
+    everybody = list({id(player): player for player in (*players, *mates)}.values())
+    places = {id(player): place for place, player in enumerate(everybody)}
+    return everybody, [places[id(mate)] for mate in mates]
 
 
 def _list_parts(group: Group) -> dict[str, list[Player]]:

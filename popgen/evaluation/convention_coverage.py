@@ -35,7 +35,7 @@ class Coverage:
 def measure_coverage(
     people: Sequence[PlayedGame], members: Sequence[PlayedGame], *, seed: int, shuffles: int = 20
 ) -> Coverage:
-    """Of games in one layout; a member's games are averaged by who played and in which seat.
+    """Of games in one layout; members' games are averaged by who played and in which seat.
 
     Raises:
         ValueError: no games of people or of members.
@@ -59,11 +59,11 @@ def measure_coverage(
 
 
 def _average_members(games: Sequence[PlayedGame]) -> np.ndarray:
-    """(m, events) mean rates of each participant in each seat."""
+    """(m, events) mean rates of each player in each seat."""
     found: dict[tuple[str, int], list[np.ndarray]] = {}
     for game in games:
-        for seat, name in enumerate(game.participants):
-            found.setdefault((name, seat), []).append(game.rates[seat])
+        for seat, participant in enumerate(game.participants):
+            found.setdefault((game.players[seat] or participant, seat), []).append(game.rates[seat])
     return np.stack([np.mean(rates, 0) for rates in found.values()])
 
 

@@ -1,10 +1,14 @@
-"""The SP/XP matrix: every member with every member, in both seatings, and beside a random and an idle partner."""
+"""The SP/XP matrix: every member with every member, in both seatings, and beside a random and an idle partner.
+
+Members that were trained in pairs never learned to play with themselves: a member's own play (SP) is that with its
+mate, cross-play (XP) that across pairs, and their cells on the diagonal are neither.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +22,7 @@ from popgen.play.policy import Policy
 from popgen.play.rollout import play_teams
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 from popgen.population.manifest import EnvironmentInfo
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population
 
 RANDOM, IDLE = "random", "idle"
@@ -79,8 +84,10 @@ class CrossPlayResult:
         training_seed: of the population's run.
         steps: environment steps taken, kind `evaluation`.
         pairings: by label of seat 0 and seat 1.
-        mixed: self-play after cross-play, for each member, partner and seat.
+        mixed: self-play after cross-play, for each member, partner and seat; none of members of pairs, which go on
+            with nobody alone.
         mixed_episodes: that it took.
+        mates: member that was trained in a pair -> the other of the pair; the others were trained with themselves.
     """
 
     environment: EnvironmentInfo
@@ -95,6 +102,7 @@ class CrossPlayResult:
     pairings: dict[tuple[str, str], Pairing]
     mixed: tuple[MixedPlay, ...] = ()
     mixed_episodes: int = 0
+    mates: Mapping[int, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         members = f"{len(self.members)} members of {self.method} in {self.environment.name}"
@@ -128,14 +136,39 @@ class CrossPlayResult:
         )
 
     @property
+    def is_paired(self) -> bool:
+        """Some member was trained in a pair."""
+        return bool(self.mates)
+
+    def mate_of(self, member: int) -> int:
+        """Number of whom a member plays its own play with: its mate, or itself."""
+        return self.mates.get(member, member)
+
+    def own_play(self, member: int) -> Estimate:
+        """Score of a member with its mate, mean over both seatings, or with itself; NaN where its mate is left out."""
+        mate = self.mate_of(member)
+        if mate == member:
+            return self.score(member, member)
+        return Estimate.average([self.score(member, mate), self.score(mate, member)])
+
+    @property
+    def crossed(self) -> list[tuple[int, int]]:
+        """Ordered pairs of members whose play is cross-play: different ones, no mates."""
+        return [(i, j) for i in self.members for j in self.members if j not in (i, self.mate_of(i))]
+
+    @property
     def sp(self) -> Estimate:
-        """Mean self-play score over members."""
-        return Estimate.average([self.score(m, m) for m in self.members])
+        """Mean score over members of play with the mate, each in seat 0, or with itself.
+
+        Members whose mate is left out of the evaluation count nowhere; NaN where all are.
+        """
+        own = [(member, self.mate_of(member)) for member in self.members]
+        return Estimate.average([self.score(*seats) for seats in own if seats[1] in self.members])
 
     @property
     def xp(self) -> Estimate:
-        """Mean cross-play score over ordered pairs of different members; NaN for one member."""
-        return Estimate.average([self.score(i, j) for i in self.members for j in self.members if i != j])
+        """Mean score over `crossed`; NaN where there is none, as for one member or one pair."""
+        return Estimate.average([self.score(*seats) for seats in self.crossed])
 
     def beside(self, partner: str, seat: int | None = None) -> Estimate:
         """Mean score of the members beside a `random` or `idle` partner sitting in `seat`, None for both."""
@@ -145,16 +178,15 @@ class CrossPlayResult:
 
     @property
     def comparisons(self) -> tuple[Obstruction, ...]:
-        """All that obstruction is judged by: members (i, j) in seats 0 and 1 against i beside the random or idle player
-        in seat 1, and against j beside it in seat 0."""
+        """All that obstruction is judged by: members (i, j) in seats 0 and 1, no mates, against i beside the random or
+        idle player in seat 1, and against j beside it in seat 0."""
         found = []
-        for i in self.members:
-            for j in self.members:
-                for partner in PARTNERS if i != j else ():
-                    for member, beside in ((i, self.score(i, partner)), (j, self.score(partner, j))):
-                        xp = self.score(i, j)
-                        chance = xp.chance_below(beside, self.episodes)
-                        found.append(Obstruction((i, j), partner, member, xp, beside, chance))
+        for i, j in self.crossed:
+            for partner in PARTNERS:
+                for member, beside in ((i, self.score(i, partner)), (j, self.score(partner, j))):
+                    xp = self.score(i, j)
+                    chance = xp.chance_below(beside, self.episodes)
+                    found.append(Obstruction((i, j), partner, member, xp, beside, chance))
         adjusted = adjust_by_holm([one.p_value for one in found])
         return tuple(replace(one, p_value=value) for one, value in zip(found, adjusted, strict=True))
 
@@ -206,7 +238,7 @@ def evaluate_population(
     """Play all ordered pairs of members, each beside a random and an idle partner in both seats, and mixed play.
 
     Args:
-        population: of at least one member.
+        population: of at least one member; mixed play is left out where members were trained in pairs.
         episodes: per ordered pair.
         seed: same arguments, same result.
         members: ids to evaluate, None for all.
@@ -223,26 +255,26 @@ def evaluate_population(
     policies += [RandomPolicy(spec.num_actions), IdlePolicy(spec.action_names)]
     # All pairs but those of the two partners among themselves.
     matches = [(i, j) for i in range(count + 2) for j in range(count + 2) if i < count or j < count]
-    own, halves, first = dict(zip(chosen, policies, strict=False)), -(-episodes // 2), len(matches) * episodes
-    tell = _tell_of_all(progress, first + count_mixed_episodes(list(own.values()), halves))
+    mates, halves, first = _choose_mates(population, chosen), -(-episodes // 2), len(matches) * episodes
+    alone = {} if mates else dict(zip(chosen, policies, strict=False))
+    tell = _tell_of_all(progress, first + count_mixed_episodes(list(alone.values()), halves))
     make = population.make_env
     played = play_teams(make, policies, matches, episodes, seed=seed, max_envs=max_envs, progress=tell)
-    mixed = play_mixed(make, own, halves, seed, progress=lambda done: tell(first + done))
-    seats = [(labels[i], labels[j]) for i, j in matches]
-    rows = [slice(n * episodes, (n + 1) * episodes) for n in range(len(matches))]
+    mixed = play_mixed(make, alone, halves, seed, progress=lambda done: tell(first + done))
     return CrossPlayResult(
         environment=population.env_info,
         method=population.manifest.method,
         event_names=tuple(spec.event_names),
-        event_weights=tuple(float(weight) for weight in spec.event_weights),
+        event_weights=tuple(map(float, spec.event_weights)),
         members=chosen,
         episodes=episodes,
         seed=seed,
         training_seed=population.manifest.seed,
         steps=played.steps + mixed.steps,
-        pairings={pair: _estimate_pairing(pair, played, own) for pair, own in zip(seats, rows, strict=True)},
+        pairings=_estimate_pairings([(labels[i], labels[j]) for i, j in matches], played, episodes),
         mixed=mixed.plays,
         mixed_episodes=mixed.episodes,
+        mates=mates,
     )
 
 
@@ -261,6 +293,18 @@ def _choose_members(population: Population, members: Sequence[int] | None) -> tu
     if not chosen or len(set(chosen)) != len(chosen):
         raise UserError("members", "must be one or more different numbers", f"choose among 1 to {len(population)}")
     return chosen
+
+
+def _choose_mates(population: Population, chosen: Sequence[int]) -> dict[int, int]:
+    mates = enumerate(find_mates(population.members), start=1)
+    return {member: mate for member, mate in mates if member in chosen and mate != member}
+
+
+def _estimate_pairings(
+    seats: Sequence[tuple[str, str]], played: Episodes, episodes: int
+) -> dict[tuple[str, str], Pairing]:
+    rows = (slice(n * episodes, (n + 1) * episodes) for n in range(len(seats)))
+    return {pair: _estimate_pairing(pair, played, own) for pair, own in zip(seats, rows, strict=True)}
 
 
 def _estimate_pairing(seats: tuple[str, str], played: Episodes, rows: slice) -> Pairing:

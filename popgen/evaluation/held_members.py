@@ -14,6 +14,7 @@ from popgen.errors import UserError
 from popgen.evaluation.estimates import Estimate
 from popgen.play.policy import Policy
 from popgen.play.rollout import play_teams
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population
 
 
@@ -23,8 +24,9 @@ class HeldMember:
 
     Attributes:
         member: from 1.
-        sp: score with itself.
-        xp: score with the earlier member that it does best with, mean over both seatings; None for the first.
+        sp: score with itself; of one that was trained in a pair with its mate, mean over both seatings.
+        xp: score with the earlier member that it does best with, its mate aside, mean over both seatings; None where
+            there is none.
         partner: that member.
     """
 
@@ -71,15 +73,17 @@ def hold_members(population: Population, episodes: int, seed: int) -> HeldScores
     seats = [(a - 1, b - 1) for a, b in matches]
     played = play_teams(population.make_env, policies, seats, episodes, seed=seed)
     scores = dict(zip(matches, played.score.reshape(len(matches), episodes), strict=True))
-    return HeldScores(episodes, seed, played.steps, tuple(_describe_member(member, scores) for member in numbers))
+    mates = zip(numbers, find_mates(population.members), strict=True)
+    return HeldScores(episodes, seed, played.steps, tuple(_describe_member(*both, scores) for both in mates))
 
 
-def _describe_member(member: int, scores: dict[tuple[int, int], np.ndarray]) -> HeldMember:
-    alone = Estimate.of(scores[member, member])
-    beside = [
-        Estimate.average([Estimate.of(scores[member, k]), Estimate.of(scores[k, member])]) for k in range(1, member)
-    ]
-    if not beside:
-        return HeldMember(member, alone, None, None)
-    best = int(np.argmax([one.mean for one in beside]))
-    return HeldMember(member, alone, beside[best], best + 1)
+def _describe_member(member: int, mate: int, scores: dict[tuple[int, int], np.ndarray]) -> HeldMember:
+    def beside(other: int) -> Estimate:
+        return Estimate.average([Estimate.of(scores[member, other]), Estimate.of(scores[other, member])])
+
+    own = Estimate.of(scores[member, member]) if mate == member else beside(mate)
+    others = {k: beside(k) for k in range(1, member) if k != mate}
+    if not others:
+        return HeldMember(member, own, None, None)
+    best = max(others, key=lambda k: others[k].mean)
+    return HeldMember(member, own, others[best], best)

@@ -1,7 +1,9 @@
 """How diverse partners are: BR-Div over what they do, and over what their best responses have to do.
 
-The counts are those of HSP's events of transitions, per episode, as in ZSC-Eval (Wang et al. 2024). In environments
-without these the environment's own events take their place.
+BR-Div is that of ZSC-Eval (Wang et al. 2024): mean counts per episode of its 14 kinds
+(`popgen.envs.player_events.BR_DIV_EVENTS`), those in seat 0 and those in seat 1 as different ones. Counts and spreads
+beside it are of all of HSP's 17 events, over both seats. In environments without these the environment's own events
+take their place.
 """
 
 from __future__ import annotations
@@ -9,13 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv
-from popgen.envs.player_events import count_player_events
+from popgen.envs.player_events import count_diversity_events, count_player_events
+from popgen.errors import UserError
 from popgen.evaluation.holdout_metrics import Interval
-from popgen.evaluation.holdout_players import Player
+from popgen.evaluation.holdout_players import Player, find_mates, list_distinct
 from popgen.play.event_diversity import Diversity, choose_most_diverse, measure_distances, measure_diversity
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play
@@ -27,7 +31,8 @@ class PartnerDiversity:
 
     Attributes:
         players: K partners.
-        counts: (K, F) mean counts of an episode.
+        counts: (K, F) mean counts of an episode, over both seats.
+        kinds: (K, 2 F') mean counts of what BR-Div is of, those in seat 0 and then those in seat 1.
         diversity: of all.
         chosen: indices of the most diverse ones that were asked for, ascending.
         chosen_diversity: of these.
@@ -38,6 +43,7 @@ class PartnerDiversity:
 
     players: tuple[Player, ...]
     counts: np.ndarray
+    kinds: np.ndarray
     diversity: Diversity
     chosen: tuple[int, ...]
     chosen_diversity: Diversity
@@ -46,14 +52,24 @@ class PartnerDiversity:
 
 
 class _EventCounter:
-    """Sums the events of every row and seat over its episode."""
+    """Sums the events of every row and seat over its episode, and what BR-Div is of."""
 
     def __init__(self, env: BatchedEnv) -> None:
-        self.env, self.counts = env, np.zeros(0)
+        self.env, self.counts, self.kinds = env, np.zeros(()), np.zeros(())
 
     def __call__(self, step: Transition) -> None:
-        events = count_player_events(self.env, step.states, step.actions, step.result) * step.counted[:, None, None]
-        self.counts = events if not self.counts.size else self.counts + events
+        taken = (self.env, step.states, step.actions, step.result)
+        counted = step.counted[:, None, None]
+        self.counts = self.counts + count_player_events(*taken) * counted
+        self.kinds = self.kinds + count_diversity_events(*taken) * counted
+
+
+class _Counts(NamedTuple):
+    """(K, 2, F) and (K, 2, F') mean counts of an episode by seat: HSP's events, and what BR-Div is of."""
+
+    events: np.ndarray
+    kinds: np.ndarray
+    steps: int
 
 
 def count_events(
@@ -63,7 +79,8 @@ def count_events(
     episodes: int,
     seed: int,
 ) -> tuple[np.ndarray, int]:
-    """(K, F) mean counts of an episode, and the environment steps taken.
+    """(K, F) mean counts of an episode over both seats, and the environment steps taken; copies of one policy are
+    played once, so that chance does not make them different.
 
     Args:
         make: (num_envs, seed) -> environment.
@@ -73,28 +90,39 @@ def count_events(
         episodes: N for each partner and seat.
         seed: same arguments, same result.
     """
+    counts = _count_by_seat(make, players, responses, episodes, seed)
+    return counts.events.mean(1), counts.steps
+
+
+def _count_by_seat(
+    make: Callable[[int, int], BatchedEnv],
+    players: Sequence[Player],
+    responses: Sequence[Player] | None,
+    episodes: int,
+    seed: int,
+) -> _Counts:
     policies: list[Policy] = [player.make() for player in players]
-    beside = [(k, _find_mate(players, k)) for k in range(len(players))]
+    beside = list(enumerate(find_mates(players)))
     if responses is not None:
         beside = [(len(players) + k, k) for k in range(len(players))]
         policies += [player.make() for player in responses]
+    kept = list_distinct(players)
     # The one whose events count sits in seat 0, then in seat 1.
-    matches = [seats for one, other in beside for seats in ((one, other), (other, one))]
+    matches = [seats for k in kept for seats in (beside[k], beside[k][::-1])]
     env = make(len(matches) * episodes, 0)
     counter = _EventCounter(env)
     played = play(env, policies, np.repeat(np.array(matches), episodes, axis=0), seed=seed, record=counter)
-    table = counter.counts.reshape(len(players), 2, episodes, 2, -1)
-    own = np.stack([table[:, seat, :, seat] for seat in (0, 1)], 1)
-    return own.mean((1, 2)), played.steps
+    rows = _find_rows(players, kept)
+    tables = (counts.reshape(len(kept), 2, episodes, 2, -1) for counts in (counter.counts, counter.kinds))
+    events, kinds = (np.stack([table[:, seat, :, seat].mean(1) for seat in (0, 1)], 1)[rows] for table in tables)
+    return _Counts(events, kinds, played.steps)
 
 
-def _find_mate(players: Sequence[Player], number: int) -> int:
-    """Number of the other of a player's pair, its own where there is none."""
-    own = players[number]
-    for k, other in enumerate(players):
-        if own.pair and k != number and (other.source, other.pair) == (own.source, own.pair):
-            return k
-    return number
+def _find_rows(players: Sequence[Player], kept: Sequence[int]) -> list[int]:
+    """For each player the row of `kept` that is the same policy."""
+    rows = {players[place].identity: row for row, place in enumerate(kept)}
+    own = {place: row for row, place in enumerate(kept)}
+    return [own.get(place, rows[player.identity]) for place, player in enumerate(players)]
 
 
 def measure_partners(
@@ -109,18 +137,29 @@ def measure_partners(
     """BR-Div of partners, and of the `choose` most diverse ones (all without it); see `count_events`.
 
     Raises:
+        UserError: more are to be chosen than are linearly independent, so that every choice has the determinant 0.
         ValueError: more are to be chosen than there are.
     """
-    counts, steps = count_events(make, players, responses, episodes, seed)
-    chosen = choose_most_diverse(counts, len(players) if choose is None else choose)
+    counted = _count_by_seat(make, players, responses, episodes, seed)
+    counts, kinds = counted.events.mean(1), counted.kinds.reshape(len(players), -1)
+    diversity = measure_diversity(kinds)
+    chosen = list(range(len(players))) if choose is None else choose_most_diverse(kinds, choose)
+    if choose is not None and choose > diversity.rank:
+        whose = "their own events" if responses is None else "their best responses' events"
+        problem = (
+            f"is {choose}, but by {whose} only {diversity.rank} of {len(players)} partners are linearly independent"
+        )
+        fix = f"choose {diversity.rank} or fewer" if diversity.rank else "give partners that do something"
+        raise UserError("--choose", problem, fix)
     return PartnerDiversity(
         players=tuple(players),
         counts=counts,
-        diversity=measure_diversity(counts),
+        kinds=kinds,
+        diversity=diversity,
         chosen=tuple(chosen),
-        chosen_diversity=measure_diversity(counts[chosen]),
+        chosen_diversity=measure_diversity(kinds[chosen]),
         spreads=_measure_spreads(players, counts),
-        steps=steps,
+        steps=counted.steps,
     )
 
 

@@ -14,6 +14,7 @@ from popgen.humans.behaviour import STEPS
 from popgen.humans.record_tables import TableGame
 from popgen.humans.recordings import HumanGame, make_human_env
 from popgen.play.rollout import Transition, play
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population
 
 
@@ -27,6 +28,7 @@ class PlayedGame(NamedTuple):
         dishes: of the team.
         counts: (2, len(EVENTS)) float64, each player's events.
         judged: whose play is to be judged, by seat: of a person and an ego the person's alone.
+        players: who plays in each seat, where several are one participant; "" where participants are players.
     """
 
     layout: str
@@ -35,6 +37,7 @@ class PlayedGame(NamedTuple):
     dishes: float
     counts: np.ndarray
     judged: tuple[bool, bool] = (True, True)
+    players: tuple[str, str] = ("", "")
 
     @property
     def rates(self) -> np.ndarray:
@@ -76,7 +79,15 @@ def count_table_games(games: Sequence[TableGame]) -> dict[str, list[PlayedGame]]
 
 
 def count_members(population: Population, episodes: int, seed: int) -> list[PlayedGame]:
-    """Games of every member with itself: what it does beside a partner that shares its conventions.
+    """Games of every member with itself, or with its mate where it was trained in a pair: what it does beside a partner
+    that shares its conventions.
+
+    The two of a pair play as many games in each seating. They share their dishes, so that they are one participant.
+
+    Args:
+        population: of members in Overcooked.
+        episodes: N of each member.
+        seed: same arguments, same result.
 
     Raises:
         UserError: the population does not play Overcooked, or has no members.
@@ -84,7 +95,8 @@ def count_members(population: Population, episodes: int, seed: int) -> list[Play
     size = len(population)
     if not size:
         raise UserError("population", f"{population.path} has no members yet", "train one first")
-    seats = np.repeat(np.arange(size), episodes)[:, None].repeat(2, 1)
+    mates = np.array(find_mates(population.members)) - 1
+    seats = np.stack([np.arange(size), mates], 1).repeat(episodes, 0)
     env = population.make_env(len(seats))
     if not isinstance(env, OvercookedEnv):
         raise UserError("population", f"{population.path} plays {env.spec.name}, not Overcooked", "give another one")
@@ -97,8 +109,20 @@ def count_members(population: Population, episodes: int, seed: int) -> list[Play
     members = [population[member] for member in range(1, size + 1)]
     result = play(env, members, seats, seed=seed, record=count)
     layout = env.spec.name.rpartition("/")[2]
-    names = [f"member {member + 1}" for member in seats[:, 0]]
     return [
-        PlayedGame(layout, (names[row], names[row]), int(steps[row]), float(result.score[row]), counts[row])
-        for row in range(len(seats))
+        PlayedGame(
+            layout,
+            participants=(_name_members(both), _name_members(both)),
+            steps=int(steps[row]),
+            dishes=float(result.score[row]),
+            counts=counts[row],
+            players=(f"member {both[0] + 1}", f"member {both[1] + 1}"),
+        )
+        for row, both in enumerate(seats)
     ]
+
+
+def _name_members(seats: np.ndarray) -> str:
+    """One member, or the two of a pair in the same order in both seatings."""
+    numbers = sorted({int(member) + 1 for member in seats})
+    return f"member{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}"

@@ -3,14 +3,16 @@
 The measure of the paper's section "Empirical Analysis of Self-Sabotage Behavior" and its table "Results of the MPPMR
 environment". It needs an environment with an event that says which player left.
 
-For agent m and each earlier agent k < m, both seatings are played. The paper counts every episode that ended early,
-whoever ended it (`ended_early`, "any exit"). An agent cannot help what its partner does, so that `self_sabotage` ("own
-exit") counts the episodes in which agent m itself left; where both leave in the same step, both count. Agent 1 has no
-earlier agents; as in the paper it stands as 0 and counts in the average.
+For agent m and each earlier agent k < m that is not its mate, with which it was trained in a pair, both seatings are
+played. The paper counts every episode that ended early, whoever ended it (`ended_early`, "any exit"). An agent cannot
+help what its partner does, so that `self_sabotage` ("own exit") counts the episodes in which agent m itself left; where
+both leave in the same step, both count. Agent 1 has no earlier agents; as in the paper it stands as 0 and counts in the
+average.
 
 Not to leave is no merit of members that share one convention: what they share stands beside it. Of two members at one
 landmark cross-play is as good as self-play; `xp_apart` is that of the other pairs, and what members get beside a random
-and an idle partner tells how much of it is a convention that the partner does not have.
+and an idle partner tells how much of it is a convention that the partner does not have. Self-play of one that was
+trained in a pair is its play with its mate.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play, play_teams
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population
 
 LEAVES = "leaves"
@@ -81,6 +84,7 @@ class SabotageResult:
         beside: partner (`random`, `idle`) -> the members' mean score with it, both seatings.
         landmarks: (M, K) how many self-play episodes of a member ended at each landmark; None without landmarks.
         paths: None where players do not move on a plane.
+        mates: number of each member's mate, from 1; its own where it has none; empty where nobody has one.
     """
 
     environment: str
@@ -95,6 +99,7 @@ class SabotageResult:
     beside: Mapping[str, Estimate]
     landmarks: np.ndarray | None
     paths: Paths | None
+    mates: tuple[int, ...] = ()
 
     @property
     def size(self) -> int:
@@ -102,14 +107,14 @@ class SabotageResult:
         return len(self.exits)
 
     def self_sabotage(self, member: int) -> float:
-        """Fraction of the episodes with earlier members in which `member` (from 1) itself left; 0 for member 1."""
-        own, earlier = member - 1, range(member - 1)
+        """Fraction of the episodes with earlier members in which `member` (from 1) itself left; 0 where none are."""
+        own, earlier = member - 1, self._list_earlier(member - 1)
         parts = [self.exits[own, k, :, 0] for k in earlier] + [self.exits[k, own, :, 1] for k in earlier]
         return float(np.mean(parts)) if parts else 0.0
 
     def ended_early(self, member: int) -> float:
         """Fraction of the episodes with earlier members that ended early, whoever ended them: the paper's reading."""
-        own, earlier = member - 1, range(member - 1)
+        own, earlier = member - 1, self._list_earlier(member - 1)
         parts = [self.ended[own, k] for k in earlier] + [self.ended[k, own] for k in earlier]
         return float(np.mean(parts)) if parts else 0.0
 
@@ -125,19 +130,28 @@ class SabotageResult:
 
     @property
     def sp(self) -> Estimate:
-        """Mean self-play score over members."""
-        return Estimate.average([Estimate.of(self.scores[m, m]) for m in range(self.size)])
+        """Mean score over members of play with the mate, each in seat 0, or with itself."""
+        return Estimate.average([Estimate.of(self.scores[m, self._find_mate(m)]) for m in range(self.size)])
 
     @property
     def xp(self) -> Estimate:
-        """Mean cross-play score over ordered pairs of different members; NaN for one member."""
-        return self._average_pairs([(i, j) for i in range(self.size) for j in range(i)])
+        """Mean cross-play score over ordered pairs of different members, no mates; NaN where there are none."""
+        return self._average_pairs([(i, j) for i in range(self.size) for j in self._list_earlier(i)])
+
+    def _find_mate(self, member: int) -> int:
+        """Whom a member plays its own play with, both from 0."""
+        return self.mates[member] - 1 if self.mates else member
+
+    def _list_earlier(self, member: int) -> list[int]:
+        """Members before it, its mate aside, from 0."""
+        return [k for k in range(member) if k != self._find_mate(member)]
 
     @property
     def xp_apart(self) -> Estimate:
         """Mean cross-play score of the pairs that do not share a landmark; NaN where there is none."""
         shared = set(self.sharing)
-        return self._average_pairs([(i, j) for i in range(self.size) for j in range(i) if (j + 1, i + 1) not in shared])
+        earlier = [(i, j) for i in range(self.size) for j in self._list_earlier(i)]
+        return self._average_pairs([(i, j) for i, j in earlier if (j + 1, i + 1) not in shared])
 
     def _average_pairs(self, pairs: Sequence[tuple[int, int]]) -> Estimate:
         """Mean over pairs, counted from 0, in both seatings."""
@@ -145,10 +159,14 @@ class SabotageResult:
 
     @property
     def sharing(self) -> list[tuple[int, int]]:
-        """Pairs of members (from 1, the earlier first) whose self-play ends at the same landmark."""
+        """Pairs of members (from 1, the earlier first), no mates, whose self-play ends at the same landmark."""
         used = [self.landmark(member + 1) for member in range(self.size)]
-        pairs = [(i, j) for j in range(self.size) for i in range(j)]
+        pairs = [(i, j) for j in range(self.size) for i in self._list_earlier(j)]
         return [(i + 1, j + 1) for i, j in pairs if used[i] is not None and used[i] == used[j]]
+
+    def count_pairs(self) -> int:
+        """Pairs of different members, no mates."""
+        return sum(len(self._list_earlier(member)) for member in range(self.size))
 
     def landmark(self, member: int) -> int | None:
         """Landmark (from 1) at which more than half of a member's self-play ends; None where there is none."""
@@ -206,7 +224,7 @@ def measure_sabotage(
     recorder = _PositionRecorder(env)
     played = play(env, policies, np.repeat(matches, episodes, axis=0), seed=seed, record=recorder)
     besides = _play_beside(population, policies, episodes, seed, env.spec.params)
-    shape = (count, count, episodes)
+    shape, mates = (count, count, episodes), find_mates(population.members)
     exits = (played.events[..., event] > 0).reshape(*shape, -1)
     return SabotageResult(
         environment=info.name,
@@ -219,8 +237,9 @@ def measure_sabotage(
         ended=(played.length < env.spec.horizon).reshape(shape),
         scores=played.score.reshape(shape),
         beside=_estimate_beside(besides.score.reshape(len(PARTNERS), 2 * count, episodes)),
-        landmarks=_count_landmarks(env, recorder, played, shape),
+        landmarks=_count_landmarks(env, recorder, played, shape, mates),
         paths=_first_paths(env, recorder, exits, shape),
+        mates=mates,
     )
 
 
@@ -270,9 +289,14 @@ class _PositionRecorder:
 
 
 def _count_landmarks(
-    env: BatchedEnv, recorder: _PositionRecorder, played: Episodes, shape: tuple[int, int, int]
+    env: BatchedEnv,
+    recorder: _PositionRecorder,
+    played: Episodes,
+    shape: tuple[int, int, int],
+    mates: Sequence[int],
 ) -> np.ndarray | None:
-    """(M, K): self-play episodes that ran to the horizon and ended with both players' centre at a landmark.
+    """(M, K): episodes of each member with its mate or itself that ran to the horizon and ended with both players'
+    centre at a landmark.
 
     At a landmark is nearer than a quarter of the least distance between two of them, so that no place belongs to two.
     """
@@ -284,8 +308,7 @@ def _count_landmarks(
     reach = between[~np.eye(len(between), dtype=bool)].min() / 4
     near = np.linalg.norm(last[:, None] - env.landmarks[None], axis=-1) < reach  # (B, K)
     near &= (played.length == env.spec.horizon)[:, None]
-    members = np.arange(shape[0])
-    return near.reshape(*shape, -1)[members, members].sum(axis=1)
+    return near.reshape(*shape, -1)[np.arange(shape[0]), np.array(mates) - 1].sum(axis=1)
 
 
 def _first_paths(
@@ -316,7 +339,7 @@ def to_dict(result: SabotageResult) -> dict[str, Any]:
         "sp": result.sp.to_dict(),
         "xp": result.xp.to_dict(),
         "xp_apart": result.xp_apart.to_dict(),
-        "pairs": {"all": result.size * (result.size - 1) // 2, "sharing": [list(pair) for pair in result.sharing]},
+        "pairs": {"all": result.count_pairs(), "sharing": [list(pair) for pair in result.sharing]},
         "beside": {partner: mean.to_dict() for partner, mean in result.beside.items()},
         "matrix": result.scores.mean(axis=-1).tolist(),
         "exits": result.exits.mean(axis=2).tolist(),

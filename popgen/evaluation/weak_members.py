@@ -1,4 +1,7 @@
-"""Members that do not play: their self-play is far below what was aimed at, or below the other members'."""
+"""Members that do not play: their self-play is far below what was aimed at, or below the other members'.
+
+Self-play of a member that was trained in a pair is its play with its mate.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +47,8 @@ def find_weak_members(result: CrossPlayResult, targets: Mapping[int, float], sha
     """
     found = []
     for member in result.members:
-        sp = result.score(member, member)
-        others = [result.score(other, other).mean for other in result.members if other != member]
+        sp = result.own_play(member)
+        others = [result.own_play(other).mean for other in result.members if other != member]
         aims = {"target": targets.get(member, 0.0)}
         aims["other members"] = float(np.median(others)) if len(others) >= OTHERS else 0.0
         what = max(aims, key=lambda name: aims[name])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from popgen.evaluation.crossplay import PARTNERS, RANDOM
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population
+from popgen.reports.crossplay_report import name_pairing
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class RecordedGame:
         actions: (T, P) uint8.
         scores: (T,) what each step added to the score.
         events: (T, P, E) uint8.
+        mates: label of each member of a pair -> that of its mate.
     """
 
     players: tuple[str, str]
@@ -35,6 +38,12 @@ class RecordedGame:
     actions: np.ndarray
     scores: np.ndarray
     events: np.ndarray
+    mates: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """SP, XP, random, idle or itself, as in the SP/XP matrix."""
+        return name_pairing(self.players, self.mates)
 
     @property
     def score(self) -> float:
@@ -50,12 +59,6 @@ class RecordedGame:
         """The first `steps` steps of it."""
         kept = {"states": self.states[: steps + 1], "actions": self.actions[:steps], "scores": self.scores[:steps]}
         return replace(self, **kept, events=self.events[:steps])
-
-    @property
-    def kind(self) -> str:
-        """SP, XP, random or idle, as in the SP/XP matrix."""
-        partner = next((p for p in PARTNERS if p in self.players), None)
-        return partner or ("SP" if self.players[0] == self.players[1] else "XP")
 
 
 def record_games(population: Population, matches: Sequence[tuple[str, str]], seed: int) -> list[RecordedGame]:
@@ -78,7 +81,7 @@ def record_games(population: Population, matches: Sequence[tuple[str, str]], see
     env = population.make_env(len(matches))
     play(env, policies, seats, seed=seed, record=steps.append)
     counted = np.stack([step.counted for step in steps])
-    games = []
+    mates, games = {str(n): str(mate) for n, mate in enumerate(find_mates(population.members), start=1)}, []
     for row, match in enumerate(matches):
         own = steps[: int(counted[:, row].sum())]
         games.append(
@@ -89,6 +92,7 @@ def record_games(population: Population, matches: Sequence[tuple[str, str]], see
                 actions=np.stack([step.actions[row] for step in own]),
                 scores=np.array([step.result.score[row] for step in own], np.float64),
                 events=np.stack([step.result.events[row] for step in own]),
+                mates=mates,
             )
         )
     return games

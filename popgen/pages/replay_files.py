@@ -8,10 +8,10 @@ Keys of the JSON object (`to_replay`):
     actions, events          names
     tile, rows, columns      side of a tile in pixels; tiles of a picture
     atlas, across            all tiles as a PNG in a data: URL, so many in a row
-    games                    list: players (labels by seat), kind (SP, XP, random or idle), seed, score; frames, T + 1
-                             lists of cell, tile, cell, tile, ... that differ from the frame before; actions, a list for
-                             each seat; gains, lists of step and what it added to the score; happened, lists of step,
-                             seat and event
+    games                    list: players (labels by seat), kind (SP, XP, random, idle, itself), seed, score; frames,
+                             T + 1 lists of cell, tile, cell, tile, ... that differ from the frame before; actions, a
+                             list for each seat; gains, lists of step and what it added to the score; happened, lists of
+                             step, seat and event
 """
 
 from __future__ import annotations

@@ -11,8 +11,9 @@ from typing import Any
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import evaluate_population
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population, load_population
-from popgen.reports.crossplay_report import to_dict
+from popgen.reports.crossplay_report import restate_pairs, to_dict
 from popgen.reports.run_record import MemberRecord, RunRecord, read_ledger, read_run
 from popgen.runs.ledger import Ledger
 from popgen.types import Kind
@@ -110,6 +111,7 @@ def read_scores(file: Path, population: Population) -> Mapping[str, Any] | None:
         scores = json.loads(file.read_text(encoding="utf-8"))
         whole = scores["members"] == list(range(1, len(population) + 1))
         same = scores["environment"]["fingerprint"] == population.env_info.fingerprint
-        return scores if whole and same and scores["format"] == "popgen-crossplay" else None
+        known = whole and same and scores["format"] == "popgen-crossplay"
+        return restate_pairs(scores, find_mates(population.members)) if known else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

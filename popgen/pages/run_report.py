@@ -13,6 +13,8 @@ from popgen.pages.page_template import fill_page
 from popgen.pages.replay_files import stage_of, to_replay
 from popgen.pages.report_charts import colour_matrix, draw_curves, draw_diagnostics, draw_steps, title_run
 from popgen.pages.report_source import ReportSource
+from popgen.population.member_pairs import find_mates
+from popgen.reports.crossplay_report import has_pairs, list_mates
 from popgen.reports.frames import estimate_text, steps_text
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_findings import Finding, explain_run, explain_scores, next_commands
@@ -27,11 +29,15 @@ _GAMES = 40
 """Replays of a report at most: eight members' self-play and their pairs are 36."""
 
 
-def choose_games(members: int) -> list[tuple[str, str]]:
-    """Who plays the replays: each member with itself, then pairs, in both seats where they are few."""
-    names = [str(member) for member in range(1, members + 1)]
-    own = [(name, name) for name in names]
-    pairs = [(i, j) for i in names for j in names if int(i) < int(j)]
+def choose_games(mates: Sequence[int]) -> list[tuple[str, str]]:
+    """Who plays the replays: each member with its mate or itself, then others, in both seats where they are few.
+
+    Args:
+        mates: number of each member's mate, from 1; its own where it has none.
+    """
+    names = [str(member) for member in range(1, len(mates) + 1)]
+    own = [(name, str(mate)) for name, mate in zip(names, mates, strict=True)]
+    pairs = [(i, j) for i in names for j in names if int(i) < int(j) and (i, j) not in own]
     both = [*pairs, *((j, i) for i, j in pairs)]
     return [*own, *(both if len(own) + len(both) <= _GAMES else pairs)][:_GAMES]
 
@@ -44,9 +50,10 @@ def report_page(source: ReportSource, *, seed: int = 0) -> str:
         seed: of the replays.
     """
     run, population = source.run, source.population
-    matches = choose_games(len(population))
+    mates = find_mates(population.members)
+    matches = choose_games(mates)
     replay = to_replay(record_games(population, matches, seed), population.make_env())
-    first_pair = next((n for n, (i, j) in enumerate(matches) if i != j), None)
+    first_pair = next((n for n, (i, j) in enumerate(matches) if mates[int(i) - 1] != int(j)), None)
     labels = [*map(str, run.scores["members"]), "random", "idle"]
     return fill_page(
         "report.html.jinja",
@@ -56,6 +63,8 @@ def report_page(source: ReportSource, *, seed: int = 0) -> str:
         facts=_list_facts(source),
         findings=[finding.as_dict() for finding in list_findings(source)],
         labels=labels,
+        mates={str(member): str(mate) for member, mate in list_mates(run.scores).items()},
+        paired=has_pairs(run.scores),
         matrix=colour_matrix(dict(run.scores)),
         unit=run.scores["unit"],
         episodes=run.scores["episodes"],
@@ -119,12 +128,13 @@ def _list_facts(source: ReportSource) -> list[dict[str, str]]:
     """Headline figures: name, value and a word below."""
     run, scores = source.run, source.run.scores
     unit = scores["unit"]
+    itself, another = ("its mate", "a member of another pair") if has_pairs(scores) else ("itself", "another member")
     real = sum(member.real for member in run.members)
     simulated = sum(member.steps.get(str(Kind.SIMULATED), 0) for member in run.members)
     seconds = [member.seconds for member in run.members if member.seconds is not None]
     facts = [
-        {"name": "SP", "value": estimate_text(scores["sp"]), "below": f"{unit} with itself"},
-        {"name": "XP", "value": estimate_text(scores["xp"]), "below": f"{unit} with another member"},
+        {"name": "SP", "value": estimate_text(scores["sp"]), "below": f"{unit} with {itself}"},
+        {"name": "XP", "value": estimate_text(scores["xp"]), "below": f"{unit} with {another}"},
         {"name": "members", "value": str(len(run.members)), "below": title_of(run.method)},
         {"name": "real environment steps", "value": steps_text(real), "below": "of training, all members"},
     ]

@@ -5,17 +5,21 @@ Keys of the JSON object (`to_json`); a figure is `{"mean": x, "standard_error": 
     format, format_version   "popgen-crossplay", 1
     environment              as in the population's manifest: name, params, fingerprint, cooking, horizon, score_name
     method, members          training method; ids in the order of the matrix
+    mates                    of the members, in their order: the other of the pair that it was trained in, itself where
+                             there is none; missing in a report of an older version (see `restate_pairs`)
     training_seed            of the population's run
     episodes, seed           episodes per ordered pair, seed of the evaluation
     unit                     of every score, such as dishes
     steps                    environment steps by ledger kind: {"evaluation": N}
-    sp, xp                   figures: mean self-play over members; mean cross-play over ordered pairs i != j
+    sp, xp                   figures: mean over members of play with the mate; mean cross-play over ordered pairs of
+                             different members that are no mates
     matrix                   mean and standard_error, lists of rows: row = seat 0, column = seat 1
     beside                   random and idle: `both` seats, partner in `seat_0`, partner in `seat_1`, all figures
     obstruction              random and idle: is xp below `beside.*.both` by more than two standard errors; comparisons:
                              how many single ones were made; level: the chance of finding any by chance alone; pairs:
                              each that was found: pair, partner, member, xp, beside and p_value (corrected by Holm)
-    mixed_play               what remains of a member's self-play after cross-play: episodes; members: member, and
+    mixed_play               what remains of a member's self-play after cross-play, empty where members were trained in
+                             pairs: episodes; members: member, and
                              seat_0, seat_1 (the seat it had before), each with kept and reset (its memory at the
                              switch): shares as figures, and least (of its partners, kept), and fresh (the share
                              that a new game of as many steps gives: what is less is lost to partners); cases: member,
@@ -32,20 +36,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import LEVEL, PARTNERS, CrossPlayResult, Obstruction, Pairing
+from popgen.evaluation.estimates import Estimate
 from popgen.jsonable import jsonable
+from popgen.population.manifest import EnvironmentInfo
 from popgen.reports.frames import Sheet, estimate_text, number_text, to_csv
 
 CSV_FIELDS = ("seat_0", "seat_1", "pairing", "figure", "seat", "mean", "standard_error", "episodes")
-"""Long format: one figure a row. `pairing` is SP, XP, random or idle; `figure` is score, reward, shaped_return or
-event:NAME; `seat` is 0 or 1 for events, empty for the team's figures."""
+"""Long format: one figure a row. `pairing` is SP, XP, random, idle, or itself, of a member of a pair with itself;
+`figure` is score, reward, shaped_return or event:NAME; `seat` is 0 or 1 for events, empty for the team's figures."""
 
 CORNER = "seat 0 / seat 1"
 """Head of the first column of the matrix: rows are seat 0, columns seat 1."""
@@ -67,6 +74,7 @@ def to_dict(result: CrossPlayResult) -> dict[str, Any]:
         "environment": result.environment.model_dump(mode="json"),
         "method": result.method,
         "members": list(result.members),
+        "mates": [result.mate_of(member) for member in result.members],
         "training_seed": result.training_seed,
         "episodes": result.episodes,
         "seed": result.seed,
@@ -79,16 +87,20 @@ def to_dict(result: CrossPlayResult) -> dict[str, Any]:
             "standard_error": jsonable(result.to_frame("error").to_numpy().tolist()),
         },
         "beside": beside,
-        "obstruction": {
-            **result.obstruction,
-            "comparisons": len(result.comparisons),
-            "level": LEVEL,
-            "pairs": [_describe_obstruction(one) for one in result.obstructions],
-        },
+        "obstruction": _describe_obstructions(result),
         "mixed_play": _describe_mixed(result),
         "event_names": list(result.event_names),
         "event_weights": list(result.event_weights),
         "pairs": [_describe_pairing(pairing) for pairing in result.pairings.values()],
+    }
+
+
+def _describe_obstructions(result: CrossPlayResult) -> dict[str, Any]:
+    return {
+        **result.obstruction,
+        "comparisons": len(result.comparisons),
+        "level": LEVEL,
+        "pairs": [_describe_obstruction(one) for one in result.obstructions],
     }
 
 
@@ -151,10 +163,25 @@ def figures_csv(result: CrossPlayResult) -> str:
     return to_csv(_list_figures(result), CSV_FIELDS)
 
 
+def name_pairing(seats: tuple[str, str], mates: Mapping[str, str]) -> str:
+    """SP, XP, random, idle, or itself, of a member of a pair with itself.
+
+    Args:
+        seats: label of the player in each seat.
+        mates: label of a member -> that of its mate; those that are missing have none.
+    """
+    if partner := next((name for name in PARTNERS if name in seats), None):
+        return partner
+    if mates.get(seats[0], seats[0]) == seats[1]:
+        return "SP"
+    return "itself" if seats[0] == seats[1] else "XP"
+
+
 def _list_figures(result: CrossPlayResult) -> Iterator[dict[str, Any]]:
+    mates = {str(member): str(result.mate_of(member)) for member in result.members}
     for pairing in result.pairings.values():
         first, second = pairing.seats
-        kind = next((p for p in PARTNERS if p in pairing.seats), "SP" if first == second else "XP")
+        kind = name_pairing(pairing.seats, mates)
         head = {"seat_0": first, "seat_1": second, "pairing": kind, "episodes": result.episodes}
         for name in ("score", "reward", "shaped"):
             figure = "shaped_return" if name == "shaped" else name
@@ -164,10 +191,79 @@ def _list_figures(result: CrossPlayResult) -> Iterator[dict[str, Any]]:
                 yield head | {"figure": f"event:{name}", "seat": seat, "mean": float(count)}
 
 
+def list_mates(report: Mapping[str, Any]) -> dict[int, int]:
+    """Member -> its mate, itself where it has none."""
+    return dict(zip(report["members"], report.get("mates", report["members"]), strict=True))
+
+
+def has_pairs(report: Mapping[str, Any]) -> bool:
+    """Some member was trained in a pair."""
+    return any(member != mate for member, mate in list_mates(report).items())
+
+
+def list_own_scores(report: Mapping[str, Any]) -> dict[int, float | None]:
+    """Member -> mean score with its mate over both seatings, or with itself; None where it is not known."""
+    means = {(one["seat_0"], one["seat_1"]): one["score"]["mean"] for one in report["pairs"]}
+    found: dict[int, float | None] = {}
+    for member, mate in list_mates(report).items():
+        both = [means.get((str(member), str(mate))), means.get((str(mate), str(member)))]
+        known = [mean for mean in both if mean is not None]
+        found[member] = sum(known) / len(known) if known else None
+    return found
+
+
+def restate_pairs(report: Mapping[str, Any], mates: Sequence[int]) -> dict[str, Any]:
+    """The JSON object with what it says of pairs put right, where an older version took their members for strangers.
+
+    Then `sp` was play of a member with itself, `xp` held play with the mate, and so did obstruction; mixed play went on
+    with one member in both seats. They are computed anew from its `pairs`; mixed play is emptied.
+
+    Args:
+        report: of an evaluation.
+        mates: number of the mate of each member of its population, from 1.
+    """
+    own = report["members"] if "mates" in report else [mates[member - 1] for member in report["members"]]
+    if own == report["members"]:
+        return dict(report)
+    pairs = zip(report["members"], own, strict=True)
+    result = _read_result(report, {member: mate for member, mate in pairs if member != mate})
+    figures = {"sp": result.sp.to_dict(), "xp": result.xp.to_dict(), "obstruction": _describe_obstructions(result)}
+    return {**report, "mates": own, **figures, "mixed_play": _describe_mixed(result)}
+
+
+def _read_result(report: Mapping[str, Any], mates: Mapping[int, int]) -> CrossPlayResult:
+    """All that SP, XP and obstruction follow from."""
+    return CrossPlayResult(
+        environment=EnvironmentInfo.model_validate(report["environment"]),
+        method=report["method"],
+        event_names=tuple(report["event_names"]),
+        event_weights=tuple(report["event_weights"]),
+        members=tuple(report["members"]),
+        episodes=report["episodes"],
+        seed=report["seed"],
+        training_seed=report["training_seed"],
+        steps=report["steps"]["evaluation"],
+        pairings={(one["seat_0"], one["seat_1"]): _read_pairing(one) for one in report["pairs"]},
+        mates=mates,
+    )
+
+
+def _read_pairing(told: Mapping[str, Any]) -> Pairing:
+    score, reward, shaped = (_read_estimate(told[name]) for name in ("score", "reward", "shaped_return"))
+    seats = (told["seat_0"], told["seat_1"])
+    return Pairing(seats, np.array(told.get("scores", [])), score, reward, shaped, np.array(told["events"]))
+
+
+def _read_estimate(figure: Mapping[str, float | None]) -> Estimate:
+    mean, error = figure["mean"], figure["standard_error"]
+    return Estimate(math.nan if mean is None else mean, math.nan if error is None else error)
+
+
 def summary(report: Mapping[str, Any]) -> list[str]:
     """The headline figures of the JSON object, a line of plain text each."""
     unit, beside = report["unit"], report["beside"]
-    lines = [f"SP mean {estimate_text(report['sp'])} {unit}", f"XP mean {estimate_text(report['xp'])} {unit}"]
+    lines = [PAIRS_LINE] if has_pairs(report) else []
+    lines += [f"SP mean {estimate_text(report['sp'])} {unit}", f"XP mean {estimate_text(report['xp'])} {unit}"]
     for partner in PARTNERS:
         row = beside[partner]
         parts = ", ".join(f"partner in seat {seat} {estimate_text(row[f'seat_{seat}'])}" for seat in (0, 1))
@@ -182,6 +278,9 @@ def summary(report: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+PAIRS_LINE = "members of pairs: SP is play with the mate, XP is across pairs, mixed play is left out"
+"""What is different where members were trained in pairs."""
+
 GOOD_SHARE = 0.9
 """Share of ordinary self-play below which a member's play after cross-play is flagged."""
 
@@ -195,9 +294,10 @@ def list_warnings(report: Mapping[str, Any]) -> list[str]:
     if blocked := [partner for partner in PARTNERS if low[partner]]:
         lines.append(f"obstruction: XP is below play beside {' and '.join(blocked)} partners")
     if pairs := sorted({tuple(one["pair"]) for one in low["pairs"]}):
-        size = len(report["members"])
         names = ", ".join(f"{i}-{j}" for i, j in pairs[:_SHOWN]) + (", ..." if len(pairs) > _SHOWN else "")
-        count = f"{len(pairs)} of {size * (size - 1)} pairs"
+        mates = list_mates(report)
+        met = sum(j not in (i, mate) for i, mate in mates.items() for j in mates)
+        count = f"{len(pairs)} of {met} pairs"
         lines.append(
             f"obstruction: {count} are worse than a random or idle partner (p <= {low.get('level', LEVEL)}): {names}"
         )
@@ -261,7 +361,9 @@ def matrix_sheet(report: Mapping[str, Any], *, narrow: bool = False) -> Sheet:
     texts = long.pivot(index="seat_0", columns="seat_1", values="text").loc[members, [*members, *PARTNERS]]
     frame = texts.rename_axis(index=CORNER.replace(" / ", "\n/ ") if narrow else CORNER, columns=None).reset_index()
     title = f"{report['environment']['name']}: {report['unit']} per episode (± standard error)"
-    return Sheet(title, frame, bold=frozenset((row, row + 1) for row in range(len(members))))
+    own = enumerate(map(str, list_mates(report).values()))
+    bold = frozenset((row, 1 + members.index(mate)) for row, mate in own if mate in members)
+    return Sheet(title, frame, bold=bold)
 
 
 def to_markdown(report: Mapping[str, Any]) -> str:

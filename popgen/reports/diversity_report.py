@@ -7,10 +7,13 @@ Keys of the JSON object (`diversity.json`):
     episodes, seed           for each partner and seat
     steps                    {"evaluation": N}
     partners                 group, source, member, sha256, in order
-    responses                how many of them have a best response
-    over                     `members`, and `best responses` where all have one: determinant, log_determinant (null for
-                             dependent partners), effective_rank, chosen (indices of partners), chosen_log_determinant,
-                             chosen_effective_rank, counts (a list of mean event counts for each partner), spreads (a
+    responses                how many of them have a best response that was trained as `training` says
+    training                 scale and settings (dotted field -> value on top of it) of best responses
+    over                     `members`, and `best responses` where all have one: determinant, log_determinant (0 and
+                             null for linearly dependent partners), effective_rank, rank, chosen (indices of partners),
+                             chosen_log_determinant, chosen_effective_rank, kinds (a list for each partner, what BR-Div
+                             is of: mean counts of `popgen.envs.player_events.BR_DIV_EVENTS` in seat 0, then in seat 1),
+                             counts (a list for each partner: of HSP's events, over both seats), spreads of these (a
                              list: group, part as below, value, low, high)
     actions                  a list for the populations whose members can tell their probabilities: group, part (`all`,
                              or the skill or role that its members have), members, entropy, own_entropy, actions,
@@ -47,6 +50,7 @@ def describe_diversity(
     *,
     actions: Sequence[MeasuredActions] = (),
     kernel: float = 0.0,
+    training: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The JSON object of the module's docstring; `kernel` is that of the trajectories' divergence."""
     players = next(iter(measured.values())).players
@@ -64,6 +68,7 @@ def describe_diversity(
                 for one in players
             ],
             "responses": responses,
+            "training": dict(training or {}),
             "over": {name: _describe_one(one) for name, one in measured.items()},
             "actions": [_describe_actions(one, kernel) for one in actions],
         }
@@ -80,9 +85,11 @@ def _describe_one(one: PartnerDiversity) -> dict[str, Any]:
         "determinant": one.diversity.determinant,
         "log_determinant": one.diversity.log_determinant,
         "effective_rank": one.diversity.effective_rank,
+        "rank": one.diversity.rank,
         "chosen": list(one.chosen),
         "chosen_log_determinant": one.chosen_diversity.log_determinant,
         "chosen_effective_rank": one.chosen_diversity.effective_rank,
+        "kinds": one.kinds.tolist(),
         "counts": one.counts.tolist(),
         "spreads": [{"group": group, "part": part, **asdict(spread)} for (group, part), spread in one.spreads.items()],
     }
@@ -131,7 +138,9 @@ def make_actions_sheet(report: Mapping[str, Any]) -> Sheet:
             title: f"{one[name]['value']:.3f} ({one[name]['low']:.3f} to {one[name]['high']:.3f})"
             for name, title in _TITLES.items()
         }
-        cells.append({"population": _name_part(one), "members": str(one["members"]), **figures})
+        share = one["trajectories"]["value"] / one["most"] if one["most"] else None
+        head = {"population": _name_part(one), "members": str(one["members"])}
+        cells.append({**head, **figures, "of ln members": number_text(share)})
     return Sheet("How differently members act, in nats (95 % interval)", pd.DataFrame(cells))
 
 
@@ -145,6 +154,12 @@ def list_lines(report: Mapping[str, Any]) -> list[str]:
         if len(one["chosen"]) < len(partners):
             names = ", ".join(f"{partners[n]['group']} {partners[n]['member']}" for n in one["chosen"])
             lines.append(f"most diverse {len(one['chosen'])} over {name}: {names}")
+        if one["rank"] < len(partners):
+            told = f"over {name} only {one['rank']} of {len(partners)} partners are linearly independent"
+            lines.append(f"{told}: the determinant is 0, its logarithm has no value")
+    if training := report["training"] if report["responses"] else {}:
+        settings = "".join(f", {name}={value}" for name, value in training["settings"].items())
+        lines.append(f"best responses were trained with scale={training['scale']}{settings}")
     if report["responses"] < len(partners):
         count = f"{report['responses']} of {len(partners)}"
         lines.append(f"{count} partners have a best response: BR-Div over these needs all of them")
@@ -152,6 +167,7 @@ def list_lines(report: Mapping[str, Any]) -> list[str]:
         kernel = report["actions"][0]["kernel"]
         lines.append("entropy: of the members' mean policy, over the states of their own games")
         lines.append(f"actions, trajectories (kernel {kernel:g}): divergence, at most ln of the number of members")
+        lines.append("of ln members: trajectories' share of the most there is; populations of any size compare by it")
     steps = report["steps"]["evaluation"]
     return [*lines, f"{report['episodes']} episodes for each partner and seat, {steps:,} environment steps"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -11,8 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from popgen.population.manifest import folder_name
+from popgen.population.member_pairs import find_mates
 from popgen.population.store import Population
-from popgen.reports.frames import Sheet
+from popgen.reports.frames import UNKNOWN, Sheet
 from popgen.types import Kind
 
 
@@ -69,15 +70,18 @@ def render_population(population: Population) -> Group:
     grid = Table.grid(padding=(0, 2))
     for name, value in facts.items():
         grid.add_row(name, Text(value))
-    return Group(grid, "", _members_sheet(report).to_rich())
+    return Group(grid, "", _members_sheet(report, find_mates(population.members)).to_rich())
 
 
-def _members_sheet(report: Mapping[str, Any]) -> Sheet:
+def _members_sheet(report: Mapping[str, Any], mates: Sequence[int]) -> Sheet:
+    """A row for each member; of one that was trained in a pair its role and its mate, with which it plays its SP."""
+    pairs = {member["id"]: mate for member, mate in zip(report["members"], mates, strict=True) if mate != member["id"]}
     frame = pd.DataFrame(
         [
             {
                 "member": str(member["id"]),
                 "policy": member["kind"],
+                **({"pair": _name_mate(member, pairs)} if pairs else {}),
                 "seed": str(member["seed"]),
                 "parameters": f"{member['parameters']:,}",
                 "MiB": f"{member['bytes'] / 2**20:.1f}",
@@ -87,4 +91,8 @@ def _members_sheet(report: Mapping[str, Any]) -> Sheet:
             for member in report["members"]
         ]
     )
-    return Sheet("", frame, labels=2)
+    return Sheet("", frame, labels=3 if pairs else 2)
+
+
+def _name_mate(member: Mapping[str, Any], pairs: Mapping[int, int]) -> str:
+    return f"{member['extra']['role']}, mate {pairs[member['id']]}" if member["id"] in pairs else UNKNOWN

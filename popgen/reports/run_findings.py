@@ -13,7 +13,7 @@ from popgen.errors import UserError
 from popgen.methods.registry import METHODS
 from popgen.reports import paper_figures as paper
 from popgen.reports.comparison import SHARE_SP, SHARE_XP
-from popgen.reports.crossplay_report import list_warnings
+from popgen.reports.crossplay_report import has_pairs, list_own_scores, list_warnings
 from popgen.reports.frames import number_text
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_record import RunRecord, differences, read_run
@@ -75,25 +75,25 @@ def _judge_self_play(scores: Mapping[str, Any]) -> Iterator[Finding]:
 
 def _judge_members(scores: Mapping[str, Any]) -> Iterator[Finding]:
     """Is one of them much weaker than the best?"""
-    own = {pair["seat_0"]: pair["score"]["mean"] for pair in scores["pairs"] if pair["seat_0"] == pair["seat_1"]}
-    known = {member: score for member, score in own.items() if score is not None}
+    known = {member: score for member, score in list_own_scores(scores).items() if score is not None}
     if len(known) < 2 or max(known.values()) <= 0:
         return
     best = max(known.values())
     weak = [f"{member} ({score:.2f})" for member, score in known.items() if score < WEAK * best]
+    itself, themselves = ("its mate", "their mates") if has_pairs(scores) else ("itself", "themselves")
     if weak:
         who = f"member{'s' if len(weak) > 1 else ''} {', '.join(weak)}"
-        yield Finding(f"weak with {'themselves' if len(weak) > 1 else 'itself'}: {who}; the best has {best:.2f}", False)
+        yield Finding(f"weak with {themselves if len(weak) > 1 else itself}: {who}; the best has {best:.2f}", False)
     else:
         least = min(known, key=lambda member: known[member])
-        yield Finding(f"every member plays with itself; the weakest is {least} with {known[least]:.2f}", True)
+        yield Finding(f"every member plays with {itself}; the weakest is {least} with {known[least]:.2f}", True)
 
 
 def _judge_cross_play(scores: Mapping[str, Any]) -> Iterator[Finding]:
     """Is XP low beside SP?"""
     sp, xp = scores["sp"]["mean"], scores["xp"]["mean"]
     if xp is None or sp is None:
-        yield Finding("one member: there is no cross-play")
+        yield Finding(f"one {'pair' if has_pairs(scores) else 'member'}: there is no cross-play")
     elif sp <= 0:
         yield Finding(f"XP {xp:.2f} says nothing while SP is {sp:.2f}")
     elif xp <= SHARE_XP * sp:

@@ -6,7 +6,7 @@ Read from `config.json`, `population/`, `ledger.jsonl`, `metrics.jsonl` and `rep
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.population import load_population
 from popgen.population.manifest import EnvironmentInfo, MemberInfo
+from popgen.population.member_pairs import find_mates
+from popgen.reports.crossplay_report import restate_pairs
 from popgen.reports.training_curves import Point, read_curves, read_lines
 from popgen.runs.ledger import Ledger, LedgerConflict
 from popgen.types import Kind, LedgerEntry
@@ -66,7 +68,8 @@ class RunRecord:
         evaluation_steps: of its own evaluations.
         lost_steps: of interrupted work that was done again; in none of the members' figures.
         attempts: how often it was started; above 1 it was interrupted, and `seconds` miss what was lost.
-        scores: `report/crossplay.json`, see `popgen.reports.crossplay_report`.
+        scores: `report/crossplay.json`, see `popgen.reports.crossplay_report`; of an older version with what it says
+            of pairs put right.
     """
 
     path: Path
@@ -97,7 +100,7 @@ def read_run(path: str | Path, label: str | None = None) -> RunRecord:
     fix = f"finish it with `popgen run` and run.id={path.name}"
     if len(population) < wanted:
         raise UserError(str(path), f"is unfinished: it has {len(population)} of {wanted} members", fix)
-    scores = _read_scores(path, fix)
+    scores = _read_scores(path, fix, find_mates(population.members))
     ledger = read_ledger(path / "ledger.jsonl")
     curves = read_curves(path / "metrics.jsonl")
     origin, adopted = config["population"].get("init_from"), 0
@@ -214,7 +217,7 @@ def _decisive_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if not name.startswith((*_FREE, "env."))}
 
 
-def _read_scores(path: Path, fix: str) -> dict[str, Any]:
+def _read_scores(path: Path, fix: str, mates: Sequence[int]) -> dict[str, Any]:
     file = path / "report" / "crossplay.json"
     try:
         scores = json.loads(file.read_text(encoding="utf-8"))
@@ -224,7 +227,7 @@ def _read_scores(path: Path, fix: str) -> dict[str, Any]:
         raise UserError(str(file), f"cannot be read ({error})", fix) from None
     if not isinstance(scores, dict) or scores.get("format") != "popgen-crossplay":
         raise UserError(str(file), "is no report of an evaluation", fix)
-    return scores
+    return restate_pairs(scores, mates)
 
 
 def _record_member(

@@ -132,6 +132,7 @@ def to_sheets(report: Mapping[str, Any]) -> list[Sheet]:
     sheets = []
     for name in dict.fromkeys(group["environment"] for group in report["groups"]):
         groups = [group for group in report["groups"] if group["environment"] == name]
+        simulated = any(group["simulated_steps"] for group in groups)
         rows = [
             {
                 "": group["label"],
@@ -140,6 +141,7 @@ def to_sheets(report: Mapping[str, Any]) -> list[Sheet]:
                 "XP": range_text(group["xp"]),
                 "SP - XP": range_text(group["gap"]),
                 "steps": steps_text(group["real_steps"]),
+                **({"simulated": steps_text(group["simulated_steps"])} if simulated else {}),
                 "minutes": number_text(None if group["seconds"] is None else group["seconds"] / 60, 1),
             }
             for group in groups

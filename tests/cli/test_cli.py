@@ -470,6 +470,9 @@ def test_evaluate_egos_beside_hold_outs(run: Run, random_population: Path, tmp_p
     code, out, err = run("evaluate", f"ego={random_population}", *words, "--out", "report", "--quiet")
     # RandomPolicy wants a number of actions, not a spec: an error of the agent's own is told in one line.
     refused((code, out, err), "cannot be made")
+    (tmp_path / "broken_agents_of_a_user.py").write_text("class North(:\n    pass\n")
+    broken = run("evaluate", "ego=broken_agents_of_a_user:North", "--with", str(other), "--quiet")
+    refused(broken, "the module broken_agents_of_a_user fails when it is imported (SyntaxError: ")
     (tmp_path / "agents_of_a_user.py").write_text(
         "import numpy as np\nclass North:\n    view = 'features'\n    def reset(self, batch, seed): pass\n"
         "    def act(self, obs, previous, first): return np.zeros(obs.shape[:2], np.uint8)\n"

@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 from overcooked_ai_py.mdp.actions import Action
 
+from popgen.envs import make_env
 from popgen.envs.overcooked import OvercookedEnv
 from popgen.envs.overcooked import kernels as k
 from popgen.envs.overcooked.bridge import to_overcooked_ai, to_overcooked_mdp
 from popgen.envs.overcooked.transition_events import EVENTS, HSP_EVENTS, find_transition_events, hsp_events
 from popgen.envs.overcooked.transition_events_bench import measure_rate
+from popgen.envs.player_events import (
+    SPARSE_REWARD,
+    count_diversity_events,
+    count_player_events,
+    name_diversity_events,
+)
 from tests.envs.cooks import Cook, Kitchen
 from tests.envs.slow_events import read_events
 
@@ -170,3 +177,38 @@ def test_hsps_names_and_bad_input() -> None:
 def test_it_is_fast() -> None:
     """The bar is 3 million a second on an idle core; machines that run tests are busy."""
     assert measure_rate(OvercookedEnv("counter_circuit_o_1order", 1024), 0.5) > 1e6
+
+
+def test_br_div_counts_thirteen_of_hsps_events_and_the_reward_of_who_delivers() -> None:
+    """Cooks in a kitchen; a delivery is worth the same each time, so that its two columns are one up to a factor."""
+    env = OvercookedEnv("cramped_room", 4, horizon=300)
+    rng, kitchen = np.random.default_rng(3), Kitchen(env)
+    cooks = [[Cook(kitchen, seat, rng, 0.3) for seat in (0, 1)] for _ in range(env.num_envs)]
+    names, total, reward = name_diversity_events(env), 0.0, np.zeros(4)
+    every = np.zeros((4, 2, len(names)))
+    hsp = np.zeros((4, 2, len(HSP_EVENTS)))
+    for _ in range(300):
+        states = env.get_state()
+        actions = np.array(
+            [[cook.act(row) for cook in pair] for pair, row in zip(cooks, states, strict=True)], np.uint8
+        )
+        result = env.step(actions)
+        every += count_diversity_events(env, states, actions, result)
+        hsp += count_player_events(env, states, actions, result)
+        reward += result.reward
+        total += result.score.sum()
+    dropped = {"MOVEMENT", "IDLE_MOVEMENT", "IDLE_INTERACT_X", "IDLE_INTERACT_EMPTY"}
+    assert len(names) == 14 and set(names) == set(HSP_EVENTS) - dropped | {SPARSE_REWARD}
+    kept = [list(HSP_EVENTS).index(name) for name in names[:-1]]
+    np.testing.assert_array_equal(every[..., :-1], hsp[..., kept])
+    assert total > 8 and every[..., -1].sum(-1).tolist() == reward.tolist()
+    np.testing.assert_allclose(every[..., -1], every[..., names.index("delivery")] * reward.sum() / total)
+    assert (every[..., -1] > 0).any(0).all(), "both seats deliver"
+
+
+def test_br_div_of_another_environment_counts_its_own_events() -> None:
+    env = make_env("rendezvous/mppmr", 2)
+    states, actions = env.get_state(), np.zeros((2, 2), np.uint8)
+    result = env.step(actions)
+    assert name_diversity_events(env) == env.spec.event_names
+    np.testing.assert_array_equal(count_diversity_events(env, states, actions, result), result.events)

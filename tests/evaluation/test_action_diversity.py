@@ -82,6 +82,44 @@ def test_figures_are_the_definitions_on_a_replayed_game(kernel: float) -> None:
     assert found.trajectories.low <= found.trajectories.value <= found.trajectories.high
 
 
+def pairs(*actions: tuple[int, int]) -> Group:
+    """Pairs of members of one action each."""
+    players = [
+        Player("hsp", "here", n, str(n), lambda n=n, a=action: member(n, action=a), role, pair)  # type: ignore[misc]
+        for pair, both in enumerate(actions, start=1)
+        for n, (action, role) in enumerate(zip(both, ("biased", "partner"), strict=True), start=2 * pair - 1)
+    ]
+    return Group("hsp", "hsp", tuple(players))
+
+
+def test_members_of_pairs_play_with_their_mates_and_are_compared_as_pairs() -> None:
+    """Biased agents do the same, their partners do not. In every own seat two of four say 0, one 4 and one 5; no two
+    joint trajectories are alike, though those of a biased agent alone would be."""
+    found = {one.part: one.found for one in measure_groups(make, [pairs((0, 4), (0, 5))], 2, 0)}
+    whole, biased, partners = (found[part] for part in ("all", "biased", "partner"))
+    assert (whole.members, biased.members) == (4, 2) and whole.steps == 8 * HORIZON
+    assert whole.entropy.value == pytest.approx(1.5 * math.log(2), abs=1e-5)
+    assert whole.trajectories.value == pytest.approx(math.log(4), abs=1e-5)
+    assert whole.share is not None and whole.share.value == pytest.approx(1.0, abs=1e-5)
+    assert biased.entropy.value == pytest.approx(0.0, abs=1e-5)
+    assert partners.entropy.value == pytest.approx(math.log(2), abs=1e-5)
+    assert biased.trajectories.value == partners.trajectories.value == pytest.approx(math.log(2), abs=1e-5)
+
+
+def test_the_same_pair_twice_is_two_members_of_four() -> None:
+    found = {one.part: one.found for one in measure_groups(make, [pairs((0, 4), (0, 4))], 2, 0)}
+    assert found["all"].trajectories.value == pytest.approx(math.log(2), abs=1e-5)
+    assert found["all"].entropy.value == pytest.approx(math.log(2), abs=1e-5)
+    share = found["all"].share
+    assert share is not None and (share.low, share.value, share.high) == pytest.approx((0.5,) * 3, abs=1e-5)
+    assert found["biased"].trajectories.value == pytest.approx(0.0, abs=1e-5)
+
+
+def test_one_member_has_no_share() -> None:
+    found = measure_actions(make, [member(1)], 2, 0)
+    assert found is not None and found.share is None and found.most == 0.0
+
+
 def test_skills_and_roles_are_measured_on_their_own_and_silent_policies_left_out() -> None:
     parts = ("initial", "final", "initial", "final", "half")
     players = tuple(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.small import kitchen
 
 from popgen.cli.parser import parse
+from popgen.envs import BatchedEnv
 from popgen.envs.overcooked.transition_events import EVENTS
 from popgen.errors import UserError
 from popgen.evaluation.convention_coverage import measure_coverage
@@ -22,9 +24,10 @@ from popgen.evaluation.convention_effects import (
     measure_effects,
     tabulate_effects,
 )
-from popgen.evaluation.played_games import PlayedGame, count_people, count_table_games
+from popgen.evaluation.played_games import PlayedGame, count_members, count_people, count_table_games
 from popgen.humans.record_tables import TableGame
 from popgen.humans.recordings import load_games
+from popgen.policies.simple_policies import RandomPolicy
 from popgen.reports.conventions_report import PlayersReport, effects_table, to_sentences, write_conventions
 
 PLATING, WALK = EVENTS.index("take_soup_from_pot"), EVENTS.index("walk")
@@ -162,6 +165,42 @@ def test_two_people_are_one_participant_whoever_has_which_seat() -> None:
     ]
     samples = collect_samples(count_table_games(tables)["people"])
     assert samples.clusters.tolist() == [0, 0, 0, 0, 1, 1]
+
+
+class Kitchen:
+    """As much of a population as counting needs: each member takes one action for 20 steps."""
+
+    path = "kitchen"
+
+    def __init__(self, *actions: str, pairs: tuple[int, ...]) -> None:
+        names = kitchen().spec.action_names
+        self._actions = [[float(name == action) for name in names] for action in actions]
+        extras = [{"role": "partner", "pair": pair} if pair else {} for pair in pairs]
+        self.members = tuple(type("MemberInfo", (), {"extra": extra})() for extra in extras)
+
+    def __len__(self) -> int:
+        return len(self._actions)
+
+    def __getitem__(self, member: int) -> RandomPolicy:
+        return RandomPolicy(6, self._actions[member - 1])
+
+    def make_env(self, num_envs: int) -> BatchedEnv:
+        return kitchen(num_envs)
+
+
+def test_games_of_a_pair_are_of_both_in_each_seating_and_of_one_participant() -> None:
+    """The first two are a pair, one stays and one interacts; the third plays with itself."""
+    population: Any = Kitchen("stay", "interact", "stay", pairs=(4, 4, 0))
+    games = count_members(population, 2, 0)
+    stays = [game.counts[:, EVENTS.index("stay")].tolist() for game in games]
+    assert stays == [[20, 0]] * 2 + [[0, 20]] * 2 + [[20, 20]] * 2
+    assert [game.participants for game in games[::2]] == [("members 1 and 2",) * 2] * 2 + [("member 3",) * 2]
+    assert games[0].players == ("member 1", "member 2") and games[2].players == ("member 2", "member 1")
+    samples = collect_samples(games)
+    assert len(set(samples.clusters.tolist())) == 2 and len(samples.clusters) == 12
+    assert measure_coverage(games, games, seed=0).members == 6, "three members in two seats"
+    with pytest.raises(UserError, match="no members yet"):
+        count_members(Kitchen(pairs=()), 2, 0)  # type: ignore[arg-type]
 
 
 def test_a_report_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:

@@ -96,6 +96,46 @@ def test_mean_xp_is_over_ordered_pairs() -> None:
     assert got.sp.error == pytest.approx(0.6 / math.sqrt(3)) and got.xp.error == pytest.approx(0.6 / math.sqrt(6))
 
 
+PAIRED = [[0, 9, 0, 0], [9, 0, 4.15, 0], [0, 3.85, 0, 11], [0, 0, 10.95, 0]]
+"""Dishes of two pairs of HSP in the cramped room, row: the member in seat 0."""
+
+
+def test_the_own_play_of_a_pair_is_play_with_the_mate_and_cross_play_is_across_pairs() -> None:
+    table = {(str(i + 1), str(j + 1)): float(PAIRED[i][j]) for i in range(4) for j in range(4)}
+    got = replace(result(table, (1, 2, 3, 4), error=0.2), mates={1: 2, 2: 1, 3: 4, 4: 3})
+    assert got.is_paired and got.sp.mean == pytest.approx((9 + 9 + 11 + 10.95) / 4)
+    assert got.sp.error == pytest.approx(0.2 / 2)
+    assert len(got.crossed) == 8 and got.xp.mean == pytest.approx(8.0 / 8)
+    assert [got.own_play(m).mean for m in got.members] == pytest.approx([9, 9, 10.975, 10.975])
+    alone = replace(got, mates={})
+    assert not alone.is_paired and alone.sp.mean == 0.0 and alone.xp.mean == pytest.approx(47.95 / 12)
+
+
+def test_mates_are_compared_with_nobody_and_one_whose_mate_is_left_out_has_no_own_play() -> None:
+    table = {(str(i + 1), str(j + 1)): float(PAIRED[i][j]) for i in range(4) for j in range(4)}
+    for partner in ("random", "idle"):
+        for member in "1234":
+            table[member, partner] = table[partner, member] = 20.0
+    got = replace(result(table, (1, 2, 3, 4)), mates={1: 2, 2: 1, 3: 4, 4: 3})
+    assert len(got.comparisons) == 8 * 4 and {one.pair for one in got.obstructions} == set(got.crossed)
+    few = replace(got, members=(1, 2, 3), mates={1: 2, 2: 1, 3: 4})
+    assert few.sp.mean == 9.0 and few.crossed == [(1, 3), (2, 3), (3, 1), (3, 2)]
+    assert math.isnan(replace(got, members=(3,), mates={3: 4}).sp.mean)
+    assert math.isnan(replace(got, members=(1, 2), mates={1: 2, 2: 1}).xp.mean)
+
+
+def test_members_of_pairs_are_evaluated_with_their_mates_and_without_mixed_play() -> None:
+    """ONE beside TWO makes 21 a step, TWO beside ONE 12; members that stay make nothing."""
+    cast = Cast(Script([ONE]), Script([TWO]), Script([STAY]), Script([STAY]), pairs=(7, 7, 5, 5))
+    got = evaluate_population(cast, 2, 0)  # type: ignore[arg-type]
+    assert got.mates == {1: 2, 2: 1, 3: 4, 4: 3} and got.mixed == () and got.mixed_episodes == 0
+    assert got.own_play(1).mean == 6 * (21 + 12) / 2 and got.sp.mean == 6 * (21 + 12) / 4
+    assert got.xp.mean == 6 * 2 * (1 + 10 + 2 + 20) / 8
+    some = evaluate_population(cast, 2, 0, [1, 3])  # type: ignore[arg-type]
+    assert some.mates == {1: 2, 3: 4} and math.isnan(some.sp.mean) and math.isnan(some.own_play(1).mean)
+    assert some.xp.mean == 6 * (1 + 10) / 2
+
+
 def test_one_member_has_no_xp() -> None:
     got = evaluate_population(Cast(Script([ONE])), 1, 0)  # type: ignore[arg-type]
     assert got.sp.mean == 66 and math.isnan(got.xp.mean) and math.isnan(got.sp.error)

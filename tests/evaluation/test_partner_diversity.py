@@ -8,8 +8,10 @@ import pytest
 from support.scripted import ONE, STAY, TWO, Script, TallyEnv
 
 from popgen.envs import make_env
-from popgen.evaluation.holdout_players import Player
-from popgen.evaluation.partner_diversity import _find_mate, count_events, measure_partners
+from popgen.envs.player_events import BR_DIV_EVENTS
+from popgen.errors import UserError
+from popgen.evaluation.holdout_players import Player, find_mates
+from popgen.evaluation.partner_diversity import count_events, measure_partners
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 
 
@@ -29,12 +31,23 @@ def test_events_are_those_of_the_member_or_of_its_response() -> None:
     assert counts.tolist() == [[0, 6], [0, 3], [6, 0]]
 
 
+def test_copies_of_a_policy_are_played_once() -> None:
+    """Two random players have counts of their own; one of them twice has not."""
+    made = [Player("g", "here", n, str(n), lambda: RandomPolicy(4)) for n in (1, 2, 3)]
+    counts, steps = count_events(TallyEnv, made, None, 4, 0)  # type: ignore[arg-type]
+    assert steps == 3 * 2 * 4 * 6 and len({tuple(row) for row in counts}) == 3
+    copies = [replace(one, identity=name) for one, name in zip(made, ("a", "b", "a"), strict=True)]
+    counts, steps = count_events(TallyEnv, copies, None, 4, 0)  # type: ignore[arg-type]
+    assert steps == 2 * 2 * 4 * 6 and counts[0].tolist() == counts[2].tolist() != counts[1].tolist()
+    assert measure_partners(TallyEnv, copies, None, 4, 0).diversity.rank < 3  # type: ignore[arg-type]
+
+
 def test_those_of_a_pair_are_counted_beside_each_other_and_spread_by_role() -> None:
     """ONE beside TWO in both seats, STAY beside ONE; three members of TWO kinds by role."""
     made = players([ONE], [TWO], [STAY], [ONE], [TWO, STAY])
     parts = [("biased", 1), ("partner", 1), ("biased", 2), ("partner", 2), ("biased", 0)]
     paired = [replace(one, part=part, pair=pair) for one, (part, pair) in zip(made, parts, strict=True)]
-    assert [_find_mate(paired, k) for k in range(5)] == [1, 0, 3, 2, 4]
+    assert find_mates(paired) == (1, 0, 3, 2, 4)
     got = measure_partners(TallyEnv, paired, None, 1, 0)  # type: ignore[arg-type]
     assert got.counts.tolist() == [[6, 0], [0, 6], [0, 0], [6, 0], [0, 3]]
     assert set(got.spreads) == {("g", "all"), ("g", "biased"), ("g", "partner")}
@@ -50,9 +63,35 @@ def test_the_most_diverse_are_chosen() -> None:
     assert got.chosen in ((0, 2), (1, 2)) and got.diversity.log_determinant == -math.inf
     assert got.diversity.effective_rank == pytest.approx(math.exp(-(2 / 3) * math.log(2 / 3) - math.log(1 / 3) / 3))
     assert got.chosen_diversity.effective_rank == pytest.approx(2.0)
-    assert got.chosen_diversity.determinant == pytest.approx(1.0, abs=1e-3)
+    assert got.chosen_diversity.determinant == pytest.approx(4.0, abs=0.01), "two columns of 1 each, one a seat"
     with pytest.raises(ValueError, match="cannot be chosen"):
         measure_partners(TallyEnv, players([ONE]), None, 1, 0, choose=2)  # type: ignore[arg-type]
+
+
+def test_br_div_keeps_the_seats_apart() -> None:
+    """ONE in one seat and TWO in the other: over both seats these two do the same, seat by seat nothing in common."""
+    scripts = (([ONE], [TWO]), ([TWO], [ONE]))
+    made = [Player("g", "here", n, str(n), lambda s=s: Script(*s)) for n, s in enumerate(scripts)]  # type: ignore[misc]
+    got = measure_partners(TallyEnv, made, None, 2, 0)  # type: ignore[arg-type]
+    assert got.counts.tolist() == [[3, 3], [3, 3]] and got.kinds.tolist() == [[6, 0, 0, 6], [0, 6, 6, 0]]
+    assert got.diversity.effective_rank == pytest.approx(2.0) and got.diversity.rank == 2
+    assert got.spreads["g", "all"].value == 0.0
+
+
+def test_more_than_are_independent_cannot_be_chosen() -> None:
+    """Two events give three partners a rank of two, whatever they do; the third direction would be rounding."""
+    mixed = players([ONE], [TWO], [ONE, TWO])
+    got = measure_partners(TallyEnv, mixed, None, 1, 0)  # type: ignore[arg-type]
+    assert (got.diversity.rank, got.diversity.determinant, got.chosen) == (2, 0.0, (0, 1, 2))
+    assert measure_partners(TallyEnv, mixed, None, 1, 0, choose=2).chosen == (0, 1)  # type: ignore[arg-type]
+    told = "--choose: is 3, but by their own events only 2 of 3 partners are linearly independent; choose 2 or fewer"
+    with pytest.raises(UserError) as caught:
+        measure_partners(TallyEnv, mixed, None, 1, 0, choose=3)  # type: ignore[arg-type]
+    assert str(caught.value) == told
+    with pytest.raises(UserError, match="by their best responses' events only 1 of 3"):
+        measure_partners(TallyEnv, mixed, players([ONE], [ONE], [ONE]), 1, 0, choose=2)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="only 0 of 1 partners are .*; give partners that do something"):
+        measure_partners(TallyEnv, players([STAY]), None, 1, 0, choose=1)  # type: ignore[arg-type]
 
 
 def test_in_a_kitchen_the_events_are_those_of_transitions() -> None:
@@ -66,3 +105,7 @@ def test_in_a_kitchen_the_events_are_those_of_transitions() -> None:
     assert counts.shape == (2, 17) and counts[0].sum() == counts[0].max() == 20  # nothing but staying
     assert (counts[1] > 0).sum() > 2
     np.testing.assert_array_equal(counts, count_events(make, [idle, rand], None, 3, 0)[0])  # type: ignore[arg-type]
+    got = measure_partners(make, [idle, rand], None, 3, 0)  # type: ignore[arg-type]
+    assert got.kinds.shape == (2, 28) and got.counts.tolist() == counts.tolist()
+    stays = BR_DIV_EVENTS.index("STAY")
+    assert got.kinds[0].nonzero()[0].tolist() == [stays, 14 + stays] and set(got.kinds[0]) == {0.0, 20.0}

@@ -5,7 +5,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +64,10 @@ class Cast:
 
     path = Path("cast")
 
-    def __init__(self, *members: Mover, **params: Any) -> None:
+    def __init__(self, *members: Mover, pairs: Sequence[int] = (), **params: Any) -> None:
         self._members = members
+        extras = [{"role": "partner", "pair": pair} if pair else {} for pair in pairs or [0] * len(members)]
+        self.members = tuple(type("MemberInfo", (), {"extra": extra})() for extra in extras)
         self.spec = make_env("rendezvous/mppmr", 1, **params).spec
         self.env_info = EnvironmentInfo.of(self.spec)
 
@@ -161,6 +163,19 @@ def test_pairs_at_one_landmark_stand_apart_from_the_others() -> None:
     told = to_dict(result)
     assert told["pairs"] == {"all": 6, "sharing": [[1, 3]]}
     assert math.isnan(measured(seeker(0.75, 0.75)).xp_apart.mean)
+
+
+def test_the_two_of_a_pair_are_no_strangers_to_each_other() -> None:
+    """Members 1 and 2 are a pair that meets at a landmark, 3 and 4 one whose second member runs to the right."""
+    result = measured(seeker(0.75, 0.75), seeker(0.75, 0.75), always(STAY), always(RIGHT), pairs=(1, 1, 2, 2))
+    scores = result.scores.mean(-1)
+    assert result.sp.mean == pytest.approx(np.mean([scores[0, 1], scores[1, 0], scores[2, 3], scores[3, 2]]))
+    across = [scores[seats] for i in (0, 1) for j in (2, 3) for seats in ((i, j), (j, i))]
+    assert result.xp.mean == pytest.approx(np.mean(across))
+    assert result.self_sabotage(4) == 1.0 and result.self_sabotage(2) == 0.0, "3 is the mate of 4, 1 that of 2"
+    assert result.sharing == [] and result.landmark(1) == result.landmark(2) is not None
+    assert result.landmark(3) is None, "its mate leaves"
+    assert to_dict(result)["pairs"]["all"] == 4
 
 
 def test_members_beside_an_idle_and_a_random_partner() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,18 @@ def test_a_member_far_below_its_target_is_named_even_alone() -> None:
 def test_figures_that_are_uncertain_or_have_no_scale_name_nobody() -> None:
     assert weak(0.0, target=10.0, error=1.3) == [] and weak(0.0, target=10.0, error=float("nan")) == [(1, "target")]
     assert weak(-50.0, -1.0, -2.0, -1.5) == [] and weak(0.0, target=10.0, share=0.0) == []
+
+
+def test_one_of_a_pair_is_measured_by_its_play_with_its_mate() -> None:
+    """Alone they serve nothing; the second pair serves little together."""
+    table = {("1", "2"): 9.0, ("2", "1"): 11.0, ("3", "4"): 1.0, ("4", "3"): 1.0}
+    known = Estimate(0.0, 0.0)
+    played = {seats: replace(one, score=known) for seats, one in result(*[0.0] * 4).pairings.items()}
+    for seats, score in table.items():
+        played[seats] = Pairing(seats, np.zeros(1), Estimate(score, 0.1), known, known, np.zeros((2, 0)))
+    pairs = replace(result(*[0.0] * 4), pairings=played, mates={1: 2, 2: 1, 3: 4, 4: 3})
+    found = find_weak_members(pairs, {}, 0.25)
+    assert [(one.member, one.aim, one.sp.mean) for one in found] == [(3, 10.0, 1.0), (4, 10.0, 1.0)]
 
 
 def test_a_weak_member_is_told_in_a_line() -> None:

@@ -103,8 +103,22 @@ def test_the_next_commands_take_the_run_as_it_was_given(
 
 @pytest.mark.parametrize(("members", "games"), [(1, 1), (2, 4), (6, 36), (8, 36), (30, 40)])
 def test_replays_are_chosen_by_their_number(members: int, games: int) -> None:
-    chosen = choose_games(members)
+    chosen = choose_games(range(1, members + 1))
     assert len(chosen) == len(set(chosen)) == games and chosen[0] == ("1", "1")
+
+
+def test_members_of_pairs_play_the_replays_with_their_mates_first() -> None:
+    chosen = choose_games((2, 1, 4, 3))
+    assert chosen[:4] == [("1", "2"), ("2", "1"), ("3", "4"), ("4", "3")]
+    assert len(chosen) == len(set(chosen)) == 4 + 8
+
+
+def test_the_page_of_pairs_says_that_they_play_with_their_mates(tmp_path: Path) -> None:
+    extras = [{"role": role, "pair": pair} for pair in (1, 2) for role in ("biased", "partner")]
+    page = report_page(read_source(finished_run(tmp_path, "pairs", [{"SP": 10}] * 4, extras=extras)))
+    assert "play with the mate (bold) is SP" in page and "dishes with its mate" in page
+    assert "Members of pairs have none" in page and "The diagonal is self-play" not in page
+    assert '"players":["1","2"],"kind":"SP"' in page.replace(" ", "")
 
 
 def test_ink_can_be_read_on_every_ground() -> None:

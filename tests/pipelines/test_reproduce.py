@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.finished import finished_run
 
@@ -31,6 +33,7 @@ from popgen.pipelines.run_measures import (
     measure_scores,
 )
 from popgen.pipelines.simulated_study import StudyToSimulate
+from popgen.reports.reproduction import measure_definitions
 from popgen.reports.reproduction.target_records import StudyBudget
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
@@ -339,20 +342,104 @@ def test_measures_of_a_finished_run(tmp_path: Path) -> None:
     assert run_measures.round_figures({"a": [1.23456789, 2]}) == {"a": [1.23457, 2]}
 
 
+PAIRS = [{"role": role, "pair": pair} for pair in (3, 12) for role in ("biased", "partner")]
+DISHES = [[0, 9, 0, 0], [9, 0, 4.15, 0], [0, 3.85, 0, 11], [0, 0, 10.95, 0]]
+"""Of members of these pairs, row: the one in seat 0."""
+
+
+def test_of_a_finished_run_of_pairs_play_with_the_mate_is_measured(tmp_path: Path) -> None:
+    """Its report is of a version that took the members of pairs for strangers."""
+    folder = finished_run(tmp_path, "pairs", [{"SP": 10}] * 4, extras=PAIRS)
+    file = folder / "report" / "crossplay.json"
+    report = json.loads(file.read_text())
+    del report["mates"]
+    for pair in report["pairs"]:
+        if pair["seat_0"].isdecimal() and pair["seat_1"].isdecimal():
+            pair["score"] = {"mean": DISHES[int(pair["seat_0"]) - 1][int(pair["seat_1"]) - 1], "standard_error": 0.1}
+    file.write_text(json.dumps(report | {"sp": {"mean": 0.0}, "xp": {"mean": 47.95 / 12}, "episodes": 20}))
+    job = RunToMeasure(folder, "HSP", 2, {})
+    scores = measure_scores(job)
+    assert scores["sp"] == pytest.approx(39.95 / 4) and scores["xp"] == pytest.approx(1.0)
+    assert "mixed" not in scores and scores["episodes"] == 20
+    assert measure_curves(job)["final"] == pytest.approx((9 + 2 * 10.975) / 3)
+    assert run_measures.measure_first(job)["final"] == 9.0
+
+
+def test_br_div_is_of_as_many_members_as_the_smallest_population_has(tmp_path: Path) -> None:
+    """Two that do the same and two others: of the four sets of three two hold both of the same."""
+    counts = np.array([[9.0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]])
+    sets = run_measures.measure_subsets(counts, 3)
+    same = math.exp(-(2 / 3) * math.log(2 / 3) - math.log(1 / 3) / 3)
+    assert sorted(one.effective_rank for one in sets) == pytest.approx([same, same, 3, 3])
+    assert [math.isinf(one.log_determinant) for one in sets].count(True) == 2
+    assert len(run_measures.measure_subsets(np.eye(30), 15)) == run_measures.SUBSETS
+    folder = finished_run(tmp_path, "four", [{"SP": 10}] * 4)
+    whole, three = (run_measures.measure_diversity(RunToMeasure(folder, "MEP", 2, {}, common=n)) for n in (0, 3))
+    assert (whole["members"], whole["of"], three["members"], three["of"]) == (4, 4, 4, 3)
+    assert three["effective_rank"] == pytest.approx(1.0) == whole["effective_rank"], "four copies of a random player"
+
+
+def test_members_that_were_trained_to_the_end_are_compared_where_there_are_enough(tmp_path: Path) -> None:
+    skills = [{"skill": skill} for skill in ("initial", "half", "final")]
+    folder = finished_run(tmp_path, "skills", [{"SP": 10}] * 3, extras=skills)
+    assert run_measures.measure_acting(RunToMeasure(folder, "FCP", 2, {}, common=3)) == {"finals": 1, "needed": 3}
+    assert run_measures.measure_acting(RunToMeasure(folder, "FCP", 2, {})) == {"finals": 1, "needed": 2}
+
+
+def test_figures_of_another_meaning_are_measured_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A measure's file of an older version, or of a plan with another smallest population, is not read."""
+    monkeypatch.chdir(tmp_path)
+    work = plan_pieces("generators", "--budget", "smoke")
+    jobs = {run.row: work.find_job(run) for run in work.wanted["generators"] if not run.teachers}
+    hsp, mep = jobs["HSP"], jobs["MEP"]
+    assert hsp.config is not None and hsp.config.population.size == 4
+    assert work.find_common_size(hsp) == work.find_common_size(mep) == 3
+    assert [work.define_measure(mep, name) for name in ("costs", "scores", "acting")] == ["1", "1", "2, of 3"]
+    assert [work.define_measure(hsp, name) for name in ("costs", "scores", "acting")] == ["1", "2", "2, of 3"]
+    Path("b/measured").mkdir(parents=True)
+    for name, told, read in (("scores", {}, False), ("scores", {"definition": "2"}, True), ("costs", {}, True)):
+        kept = {"run": str(hsp.folder), "episodes": 2, "figures": {"sp": 0.0}, **told}
+        reproduction_pieces.write_json(work.find_measured(hsp, name), kept)
+        assert work.is_measured(hsp, name) is read
+    kept = {"run": str(mep.folder), "episodes": 2, "figures": {}, "definition": "2, of 4"}
+    reproduction_pieces.write_json(work.find_measured(mep, "diversity"), kept)
+    assert not work.is_measured(mep, "diversity")
+
+
+def test_an_earlier_record_tells_only_figures_of_todays_meaning(
+    run: Run, training: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing is trained the rest of a row stays; otherwise its run, which is gone, is made again."""
+    assert run("reproduce", "sp-xp", *SMALL, "--publish", "kept")[0] == 0
+    first = json.loads((tmp_path / "kept" / "sp-xp-smoke-population.size=2.json").read_text())["runs"][0]
+    assert first["definitions"] == {"scores": "1", "costs": "1"} and set(first["figures"]) == {"scores", "costs"}
+    shutil.rmtree(tmp_path / "out")
+    monkeypatch.setitem(measure_definitions.DEFINITIONS, "costs", 2)
+    again = ("reproduce", "sp-xp", *SMALL, "--records", "kept")
+    assert run(*again, "--finished")[0] == 0 and len(training.calls) == 4
+    told = json.loads((tmp_path / "out" / "sp-xp" / "record.json").read_text())["runs"]
+    assert [one["figures"] for one in told] == [{"scores": one["figures"]["scores"]} for one in told] and len(told) == 4
+    code, out, _ = run(*again, "--dry-run", "--json")
+    assert code == 0 and json.loads(out)["targets"][0]["runs_done"] == 0
+    assert run(*again)[0] == 0 and len(training.calls) == 8
+    told = json.loads((tmp_path / "out" / "sp-xp" / "record.json").read_text())["runs"][0]
+    assert told["definitions"] == {"scores": "1", "costs": "2"}
+
+
 def test_an_ego_is_measured_beside_the_clone_of_people_that_is_fitted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The ego is a random player here, and so is the clone; an interrupted fit is done again."""
+    """The ego is a random player here, and so is the clone."""
     folder = finished_run(tmp_path, "one", [{"SP": 10}])
     asked: list[tuple[str, str, int]] = []
 
-    def fit(path: Path, layout: str, half: str, *, seed: int, search: Any) -> None:
+    def fit(path: Path, layout: str, half: str, *, search: Any, **_: Any) -> None:
         asked.append((layout, half, search.drawn))
         shutil.copytree(folder / "population", path)
 
     monkeypatch.setattr(proxies, "fit_population", fit)
-    (tmp_path / "humans" / ".cramped_room_B").mkdir(parents=True)
     job = RunToMeasure(folder, "XPM-WM", 2, {}, humans=tmp_path / "humans", proxy={"drawn": 3})
     assert run_measures.measure_human(job)["score"] >= 0.0 and run_measures.measure_human(job)["score"] < 2.0
     assert asked == [("cramped_room", "B", 3)]
-    assert [path.name for path in (tmp_path / "humans").iterdir()] == ["cramped_room_B"]
+    (kept,) = (tmp_path / "humans").iterdir()
+    assert kept.name.startswith("cramped_room_B-s0-")

@@ -265,6 +265,18 @@ def test_the_strongest_partner_is_judged_over_both_seatings() -> None:
     assert hold_members(cast, 2, 0).members[1].xp == Estimate(6 * (2 + 20) / 2, 0.0)  # type: ignore[arg-type]
 
 
+def test_of_a_pair_play_with_the_mate_is_held_and_no_cross_play() -> None:
+    """ONE beside TWO makes 21 a step in one seating and 12 in the other; STAY beside ONE 1 or 10."""
+    from support.scripted import ONE, STAY, TWO, Cast, Script
+
+    cast = Cast(Script([ONE]), Script([TWO]), Script([STAY]), Script([ONE]), pairs=(1, 1, 2, 2))
+    first, second, third, fourth = hold_members(cast, 2, 0).members  # type: ignore[arg-type]
+    assert first.sp.mean == second.sp.mean == 6 * (21 + 12) / 2 and third.sp.mean == fourth.sp.mean == 6 * (1 + 10) / 2
+    assert first.xp is None and second.xp is None and second.partner is None
+    assert (third.partner, fourth.partner) == (2, 2) and third.xp is not None and fourth.xp is not None
+    assert third.xp.mean == 6 * (20 + 2) / 2 and fourth.xp.mean == 6 * (21 + 12) / 2
+
+
 def test_thresholds_are_the_papers_or_the_users(model: RunRecord) -> None:
     assert default_thresholds(CRAMPED) == Thresholds(8.18, 2.05) and default_thresholds("rendezvous/mppmr") is None
     groups = group_runs([model])

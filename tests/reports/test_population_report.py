@@ -44,6 +44,16 @@ def test_render_says_what_is_there(tmp_path: Path) -> None:
         assert part in text.getvalue(), part
 
 
+def test_the_mates_of_pairs_are_named(tmp_path: Path) -> None:
+    spec = make_env("rendezvous/mppmr", 1).spec
+    writer = PopulationWriter(tmp_path, spec, method="hsp", config_digest="d", seed=0)
+    for role, pair in (("biased", 3), ("partner", 3), ("biased", 12)):
+        writer.add_member(RandomPolicy(5), seed=1, steps={"SP": 1}, extra={"role": role, "pair": pair})
+    text = io.StringIO()
+    Console(file=text, width=100).print(render_population(load_population(tmp_path)))
+    assert "biased, mate 2" in text.getvalue() and "partner, mate 1" in text.getvalue()
+
+
 def test_an_empty_population_can_be_shown(tmp_path: Path) -> None:
     spec = make_env("rendezvous/mppmr", 1).spec
     PopulationWriter(tmp_path, spec, method="xpm_wm", config_digest="d", seed=0)

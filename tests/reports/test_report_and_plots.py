@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -97,6 +98,47 @@ def test_table_and_summary_can_be_made_of_the_json_alone(result: CrossPlayResult
             Console(file=out, width=80).print(table)
             tables.append(out.getvalue())
         assert tables[0] == tables[1] and "idle" in tables[0]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> CrossPlayResult:
+    """ONE beside TWO makes 126 or 72 of 6 steps, STAY beside STAY nothing."""
+    cast = Cast(Script([ONE]), Script([TWO]), Script([STAY]), Script([STAY]), pairs=(3, 3, 12, 12))
+    return evaluate_population(cast, 3, 0)  # type: ignore[arg-type]
+
+
+def test_a_report_of_pairs_says_so(pairs: CrossPlayResult) -> None:
+    told = report.to_dict(pairs)
+    assert told["mates"] == [2, 1, 4, 3] and report.list_own_scores(told) == {1: 99.0, 2: 99.0, 3: 0.0, 4: 0.0}
+    assert told["sp"]["mean"] == 49.5 and told["mixed_play"]["members"] == [] and report.has_pairs(told)
+    assert report.summary(told)[0] == report.PAIRS_LINE and "SP mean 49.50 ± 0.00 points" in report.summary(told)
+    assert report.mixed_play_sheet(told) is None
+    assert report.matrix_sheet(told).bold == {(0, 2), (1, 1), (2, 4), (3, 3)}
+    rows = csv.DictReader(io.StringIO(report.figures_csv(pairs)))
+    kinds = {(row["seat_0"], row["seat_1"]): row["pairing"] for row in rows}
+    assert (kinds["1", "2"], kinds["4", "3"], kinds["1", "1"], kinds["1", "3"]) == ("SP", "SP", "itself", "XP")
+    assert kinds["random", "2"] == "random"
+
+
+def test_a_report_of_an_older_version_is_put_right(pairs: CrossPlayResult, result: CrossPlayResult) -> None:
+    """Members of pairs stood there as strangers: SP was the diagonal, XP held play with the mate."""
+    right = report.to_dict(pairs)
+    old = report.to_dict(replace(pairs, mates={}))
+    del old["mates"]
+    assert old["obstruction"]["comparisons"] == 12 * 4 != right["obstruction"]["comparisons"]
+    old |= {"sp": {"mean": 0.0, "standard_error": 0.0}, "xp": {"mean": 4.0, "standard_error": 0.1}}
+    old["mixed_play"] = {"episodes": 2, "members": [{"member": 1}], "cases": []}
+    assert report.restate_pairs(old, (2, 1, 4, 3)) == right
+    assert report.restate_pairs(right, (2, 1, 4, 3)) == right
+    alone = report.to_dict(result)
+    del alone["mates"]
+    assert report.restate_pairs(alone, (1, 2)) == alone and report.list_own_scores(alone) == {1: 6.0, 2: 132.0}
+
+
+def test_obstruction_counts_the_pairs_that_could_meet(pairs: CrossPlayResult) -> None:
+    told = report.to_dict(pairs)
+    told["obstruction"]["pairs"] = [{"pair": [1, 3]}]
+    assert any("1 of 8 pairs are worse" in line for line in report.list_warnings(told))
 
 
 def test_figures_as_text() -> None:

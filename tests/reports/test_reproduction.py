@@ -122,7 +122,8 @@ def test_every_generator_has_an_ego_beside_the_same_holdouts_and_people() -> Non
     figures = {column.figure for column in TARGETS["generators"].columns}
     wanted = ("scores.sp", "scores.xp", "scores.mixed", "scores.obstructed", "diversity.log_determinant")
     wanted += ("diversity.effective_rank", "conventions.nearest", "holdout.average", "human.score")
-    assert {*wanted, "costs.real", "costs.minutes"} <= figures
+    wanted += ("diversity.members", "acting.share")
+    assert {*wanted, "costs.real", "costs.simulated", "costs.minutes"} <= figures
     assert {name_missing(one, runs) for one in runs if one.row == "LIPO"} == {"LIPO", "LIPO's ego"}
     alone = TARGETS["ego"].list_runs(BUDGETS["laptop"], [1])
     assert {name_missing(one, alone) for one in alone} == {one.row for one in alone}
@@ -169,6 +170,58 @@ def test_panels_of_an_environment_name_their_rows_once() -> None:
         reproduction_charts._draw_bar_panel(axes, rows, target, "rendezvous/mppmr", title)
         names.append([label.get_text() for label in axes.get_yticklabels()])
     assert names[0] == ["LIPO, paper", "LIPO (paper)", "CoMeDi (paper)", "XPM-Sim (paper)"] and names[1] == [""] * 4
+
+
+ROOM = "overcooked/cramped_room"
+
+
+def flatten(text: str) -> str:
+    return " ".join(text.split())
+
+
+def test_the_episodes_of_a_runs_own_evaluation_are_told_and_none_that_are_not_known() -> None:
+    """Runs are taken over whatever their own evaluation was: one of two episodes is not called one of twenty."""
+    two, twenty = (run("LIPO", n, {"scores": {"sp": 9.0, "episodes": n}}, ROOM) for n in (2, 20))
+    old = run("LIPO", 3, {"scores": {"sp": 9.0}, "held": {"passed": 1}}, ROOM)
+    own = "SP, XP, play beside random and idle partners and mixed play are of the runs' own evaluations"
+    told = flatten(to_report(record("sp-xp", [two, twenty])))
+    assert f"{own}, with 2 to 20 episodes for each pair." in told and "made for this table" not in told
+    told = flatten(to_report(record("baselines", [old])))
+    assert f"{own}. " in told and "Other figures of play are of evaluations made for this table, with 20" in told
+    told = flatten(to_report(record("sp-xp", [old, twenty])))
+    assert f"{own}, with 20 episodes for each pair, where that is known." in told
+    told = flatten(to_report(record("wall-clock", [run("LIPO", 1, {"costs": {"real": 9}}, ROOM)])))
+    assert "episodes" not in told
+
+
+def generators() -> dict[str, Any]:
+    """A run of HSP with four members that plays, and one of FCP with one final member of three."""
+    meanings = {"definitions": {"diversity": "2, of 3", "acting": "2, of 3", "scores": "2"}}
+    pairs = {"members": 4, "of": 3, "effective_rank": 2.5}
+    acting = {"members": 4, "trajectories": 1.0397, "share": 0.75}
+    hsp = run("HSP", 1, {"scores": {"sp": 9.99}, "diversity": pairs, "acting": acting}, ROOM) | meanings
+    few = {"diversity": {"members": 3, "of": 3}, "acting": {"finals": 1, "needed": 3}, "costs": {"simulated": 5}}
+    return record("generators", [hsp, run("FCP", 1, few, ROOM) | meanings])
+
+
+def test_populations_of_different_size_are_compared_by_what_does_not_grow_with_it() -> None:
+    told = generators()
+    table = make_sheets(told, TARGETS["generators"])[0].frame.set_index("")
+    assert table["members"].tolist()[:2] == ["4", "3"] and table.loc["HSP", "effective rank"] == "2.5"
+    share = table["divergence of trajectories, of ln K"]
+    assert share.tolist()[:2] == ["0.75", "-"] and table.loc["FCP", "simulated steps"] == "5"
+    text = flatten(to_report(told))
+    assert "BR-Div is of 3 members, as many as the smallest population here has" in text
+    assert "left out where there are fewer than 3 of them: FCP (1)." in text
+
+
+def test_figures_of_an_older_meaning_are_not_printed() -> None:
+    """Of members of pairs SP was play with themselves; of the others it was what it is."""
+    figures = {"scores": {"sp": 0.0}, "diversity": {"effective_rank": 3.3}, "costs": {"real": 7}}
+    old = record("generators", [run("HSP", 1, figures, ROOM), run("MEP", 1, figures, ROOM)])
+    table = make_sheets(old, TARGETS["generators"])[0].frame.set_index("")
+    assert table.loc["HSP", "SP"] == "-" and table.loc["MEP", "SP"] == "0.00" and table.loc["HSP", "real steps"] == "7"
+    assert "effective rank" not in table.columns
 
 
 def test_a_page_of_records_is_the_same_twice(tmp_path: Path) -> None:

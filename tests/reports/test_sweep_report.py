@@ -51,6 +51,9 @@ def test_groups_are_settings_over_their_seeds_and_the_largest_gap_is_the_best(tm
     assert summary(report)[-1] == "missing: d1 (the disk is full)"
     (sheet,) = to_sheets(report)
     assert sheet.frame["SP - XP"].tolist() == ["7.00 (-5.71 to 19.71)", "8.50 (2.15 to 14.85)", "1.00"]
+    assert sheet.frame["steps"].tolist() == ["1.5k"] * 3 and sheet.frame["simulated"].tolist() == ["500"] * 3
+    (plain,) = to_sheets({**report, "groups": [group | {"simulated_steps": 0} for group in report["groups"]]})
+    assert "simulated" not in plain.frame
     lines = runs_csv(report).splitlines()
     assert lines[0].endswith("seconds,xpm_sim.lambda_xp") and lines[3].startswith("b1,xpm_sim,")
     assert lines[5].endswith(",")  # no such setting

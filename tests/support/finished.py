@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from popgen.config.run_config import RunConfig
-from popgen.envs import make_env
+from popgen.envs import EnvSpec, make_env
 from popgen.evaluation.crossplay import evaluate_population
 from popgen.policies.simple_policies import RandomPolicy
 from popgen.population import PopulationWriter, load_population
@@ -33,6 +33,7 @@ def finished_run(
     params: Mapping[str, Any] | None = None,
     scores: tuple[float, float | None] = (10.0, 0.5),
     settings: Mapping[str, Any] | None = None,
+    extras: Sequence[Mapping[str, Any]] | None = None,
 ) -> Path:
     """A run of random players.
 
@@ -43,6 +44,7 @@ def finished_run(
         params: of the environment.
         scores: SP and XP of its report.
         settings: further sections of its config.
+        extras: of the members, on top of their times.
     """
     folder = root / name
     horizon = {"horizon": 20} if env.startswith("overcooked") else {}
@@ -55,21 +57,27 @@ def finished_run(
     }
     config = RunConfig.parse(values)
     spec = make_env(config.env.name, 1, **config.env.params).spec
-    identity = {"method": method, "config_digest": config.digest(), "seed": seed}
-    writer = PopulationWriter(folder / "population", spec, **identity, resume=True)
-    (folder / "config.json").write_text(json.dumps(config.as_dict()))
-    (folder / "attempts.txt").write_text("2026-01-01\n")
+    writer = _start_run(folder, config, spec)
     ledger = Ledger(folder / "ledger.jsonl")
-    for member, (taken, time) in enumerate(zip(steps, seconds or [60.0] * len(steps), strict=True), start=1):
+    times = seconds or [60.0] * len(steps)
+    for member, (taken, time, more) in enumerate(zip(steps, times, extras or [{}] * len(steps), strict=True), start=1):
         _record_steps(ledger, name, member, taken)
         recorded = {kind: count for kind, count in taken.items() if kind != "simulated"}
-        extra = {"seconds": time} if time is not None else {}
+        extra = {**more} if time is None else {"seconds": time, **more}
         writer.add_member(RandomPolicy(spec.num_actions), seed=member, steps=recorded, extra=extra)
     ledger.record(LedgerEntry(name, len(steps), Kind.EVALUATION, "evaluation", 0, 77, 1, 0.0))
     ledger.flush()
     _write_metrics(folder, curves or {})
     write_scores(folder, *scores)
     return folder
+
+
+def _start_run(folder: Path, config: RunConfig, spec: EnvSpec) -> PopulationWriter:
+    identity = {"method": config.method, "config_digest": config.digest(), "seed": config.run.seed}
+    writer = PopulationWriter(folder / "population", spec, **identity, resume=True)
+    (folder / "config.json").write_text(json.dumps(config.as_dict()))
+    (folder / "attempts.txt").write_text("2026-01-01\n")
+    return writer
 
 
 def _record_steps(ledger: Ledger, name: str, member: int, taken: Mapping[str, int]) -> None:

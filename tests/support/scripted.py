@@ -112,12 +112,17 @@ class Script:
 
 
 class Cast:
-    """As much of a population as an evaluation needs, with given members in TallyEnv."""
+    """As much of a population as an evaluation needs, with given members in TallyEnv.
+
+    `pairs`: number of the pair that each was trained in, 0 for none; all of them for no pairs."""
 
     path = "cast"
 
-    def __init__(self, *members: Script) -> None:
+    def __init__(self, *members: Script, pairs: Sequence[int] = ()) -> None:
         self._members, self.spec, self.env_info = members, TallyEnv.spec, EnvironmentInfo.of(TallyEnv.spec)
+        numbers = pairs or [0] * len(members)
+        extras = [{"role": "partner", "pair": pair} if pair else {} for pair in numbers]
+        self.members = tuple(type("MemberInfo", (), {"extra": extra})() for extra in extras)
         self.manifest = type("Manifest", (), {"method": "by_hand", "seed": 0})()
 
     def __len__(self) -> int:

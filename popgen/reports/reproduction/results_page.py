@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import textwrap
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from popgen.errors import UserError
-from popgen.reports.reproduction.run_tables import LEVEL, make_run_sheet, make_sheets
+from popgen.reports.reproduction.run_tables import LEVEL, find_figure, make_run_sheet, make_sheets
 from popgen.reports.reproduction.target_records import Record
 from popgen.reports.reproduction.target_registry import TARGETS
 
@@ -107,10 +108,22 @@ def _wrap_text(text: str, start: str = "") -> str:
     )
 
 
+OWN = {
+    "scores": "SP, XP, play beside random and idle partners and mixed play",
+    "curves": "final scores",
+    "first": "final scores",
+}
+"""Measures whose figures are of a run's own evaluation, and what these are; its episodes may be others than the
+record's, since runs that differ in them are taken over."""
+
+_UNPLAYED = ("costs",)
+"""Measures that nothing is played for."""
+
+
 def _list_origins(record: Record) -> list[str]:
     """Sentences: evaluation, machines, runs made before."""
     runs = record["runs"]
-    told = [f"Budget {record['budget']}; {record['episodes']} episodes for each pair, written {record['written']}."]
+    told = [f"Budget {record['budget']}, written {record['written']}.", *_list_episodes(record)]
     machines = Counter(run["machine"] or "a machine that is not known" for run in runs)
     told.append("Runs: " + "; ".join(f"{count} on {name}" for name, count in machines.items()) + ".")
     if before := sum(run["taken_over"] for run in runs):
@@ -121,6 +134,51 @@ def _list_origins(record: Record) -> list[str]:
     if any(run["changed"] for run in runs):
         told.append("A commit with + had changes that were not committed.")
     return told
+
+
+def _list_episodes(record: Record) -> list[str]:
+    """How much was played for which figures; no number of what is not known."""
+    measures = list(dict.fromkeys(name for run in record["runs"] for name in run["figures"]))
+    told = []
+    if own := [name for name in measures if name in OWN]:
+        kept = [
+            run["figures"][name].get("episodes") for run in record["runs"] for name in own if name in run["figures"]
+        ]
+        known = sorted({episodes for episodes in kept if episodes is not None})
+        text = " and ".join(dict.fromkeys(OWN[name] for name in own))
+        text = f"{text[0].upper()}{text[1:]} are of the runs' own evaluations"
+        if known:
+            most = f"{known[0]} to {known[-1]}" if len(known) > 1 else str(known[0])
+            text += f", with {most} episodes for each pair{', where that is known' if None in kept else ''}"
+        told.append(f"{text}.")
+    if any(name not in (*OWN, *_UNPLAYED) for name in measures):
+        what = "Other figures of play" if own else "Figures of play"
+        told.append(f"{what} are of evaluations made for this table, with {record['episodes']} episodes each.")
+    return [*told, *_list_sizes(record)]
+
+
+def _list_sizes(record: Record) -> list[str]:
+    """Of how many members diversity is, and of whom too few are there."""
+    told, runs = [], record["runs"]
+    sizes = sorted({size for run in runs if (size := find_figure(run, "diversity.of")) is not None})
+    if sizes:
+        most = f"{sizes[0]} to {sizes[-1]}" if len(sizes) > 1 else str(sizes[0])
+        told.append(
+            f"BR-Div is of {most} members, as many as the smallest population here has: of larger ones the mean over "
+            "all sets of so many."
+        )
+    few = {run["row"]: f"{run['row']} ({find_figure(run, 'acting.finals')})" for run in runs if _lacks_finals(run)}
+    if few:
+        needed = max(find_figure(run, "acting.needed") for run in runs if _lacks_finals(run))
+        told.append(
+            f"Entropy and divergence are of members that were trained to the end, and left out where there are fewer "
+            f"than {needed} of them: {', '.join(few.values())}."
+        )
+    return told
+
+
+def _lacks_finals(run: Mapping[str, Any]) -> bool:
+    return find_figure(run, "acting.finals") is not None
 
 
 def _list_missing(record: Record) -> list[str]:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from popgen.evaluation.estimates import measure_half_interval
 from popgen.reports.frames import UNKNOWN, Sheet, to_csv
+from popgen.reports.reproduction.measure_definitions import is_outdated
 from popgen.reports.reproduction.target_records import Column, PaperLine, Record, Target
 
 LEVEL = "95 %"
@@ -72,8 +73,10 @@ def take_interval(values: Sequence[float]) -> Interval | None:
 
 
 def find_figure(run: Mapping[str, Any], figure: str) -> Any:
-    """`measure.name` of a run of a record; None where it is not there."""
+    """`measure.name` of a run of a record; None where it is not there, or means something else today."""
     measure, _, name = figure.partition(".")
+    if is_outdated(run, measure):
+        return None
     return run["figures"].get(measure, {}).get(name)
 
 

@@ -67,7 +67,12 @@ _MIXED = (
     Column("obstructed pairs", "scores.obstructed", 1),
 )
 _HELD = (Column("agents that pass", "held.passed", 1), Column("steps until all pass", "held.steps", 0))
-_COSTS = (Column("real steps", "costs.real", 0), Column("minutes", "costs.minutes", 1))
+_REAL, _MINUTES = Column("real steps", "costs.real", 0), Column("minutes", "costs.minutes", 1)
+_COSTS = (_REAL, Column("simulated steps", "costs.simulated", 0), _MINUTES)
+_SIMULATED = (
+    "Simulated steps are of the exact simulator, the same compiled environment as that of real ones; they are in no "
+    "other figure."
+)
 
 TARGETS = {
     target.name: target
@@ -135,6 +140,7 @@ TARGETS = {
             (
                 "XP below play beside a random partner is obstruction, not another convention. Mixed play: what "
                 "remains of self-play from a random step of a cross-play episode on, over members and seats.",
+                _SIMULATED,
             ),
         ),
         Target(
@@ -254,6 +260,7 @@ TARGETS = {
             (*_PLAY, *_BESIDE, *_MIXED, Column(ANY_EXIT, "sabotage.any_exit", 3), *_COSTS),
             "draw_bars",
             (SP, XP),
+            notes=(_SIMULATED,),
         ),
         Target(
             "baselines",
@@ -266,7 +273,7 @@ TARGETS = {
                 *_BESIDE,
                 *_MIXED,
                 *_HELD,
-                *_COSTS,
+                *(_REAL, _MINUTES),
             ),
             "draw_bars",
             (SP, XP),
@@ -279,13 +286,14 @@ TARGETS = {
             "",
             run_lists.list_generators,
             (
+                Column("members", "diversity.members", 0),
                 *_PLAY,
                 *_BESIDE,
                 *_MIXED,
                 Column("BR-Div, log det", "diversity.log_determinant", 1),
                 Column("effective rank", "diversity.effective_rank", 1),
                 Column("entropy of the mean policy", "acting.entropy", 2),
-                Column("divergence of trajectories", "acting.trajectories", 2),
+                Column("divergence of trajectories, of ln K", "acting.share", 2),
                 Column("nearest to people", "conventions.nearest"),
                 Column("of the average person", "conventions.average"),
                 *_COSTS,
@@ -298,8 +306,13 @@ TARGETS = {
             paper_lines.list_score_lines,
             (
                 "Egos of all populations are held against the same: populations of the next seed of the paper's three "
-                "methods, and a clone of the people whose games are held out. Steps count discarded runs. Members of "
-                "pairs (HSP, BP, BRDiv) are not meant to play with themselves.",
+                "methods, and a clone of the people whose games are held out. Steps count discarded runs.",
+                "Members of pairs (HSP, BP, BRDiv) never learned to play with themselves: SP is play with the mate, XP "
+                "is across pairs, and mixed play, which goes on with one member in both seats, is left out. Their "
+                "events, actions and dishes are those beside the mate too.",
+                "Divergence: of joint trajectories, as a share of ln K, the most that K members can have; K is all "
+                "members, or those that were trained to the end.",
+                _SIMULATED,
                 "Nearest to people: as in the table of conventions; populations cover people only below the average "
                 "person.",
             ),
