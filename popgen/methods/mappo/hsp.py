@@ -6,7 +6,8 @@
 A pool of pairs is trained together. In the end pairs that deliver next to nothing are dropped (`hsp.least_score`), as
 ZSC-Eval (Wang et al. 2024) drops them. Of the others those become members whose biased agents do the most different
 things: HSP's choice, by the distance of their mean event counts. ZSC-Eval takes the same pairs as hold-outs,
-behaviour-preferring partners and their best responses, and chooses by what the responses do (BR-Div). Where too few
+behaviour-preferring partners and their best responses, and chooses by what the responses do (BR-Div; here of both
+seats together, since no counts are kept of each). Where too few
 deliver, the best of the rest are taken, and a line says so. Environment steps of all pairs are counted, evenly for all
 members, since each is chosen from all; scores during training are those of pairs (`pair_3/sp`), as no member is known.
 
@@ -23,7 +24,7 @@ import numpy as np
 
 from popgen.envs import make_env
 from popgen.envs.contract import EnvSpec
-from popgen.envs.player_events import name_player_events
+from popgen.envs.player_events import BR_DIV_EVENTS, SPARSE_REWARD, name_player_events
 from popgen.methods.mappo.config import BpRun, HspConfig, HspRun
 from popgen.methods.mappo.hidden_utility import draw_utility
 from popgen.methods.mappo.needs import roles_of
@@ -139,7 +140,7 @@ class HspTraining(RllibTraining):
         if self.hsp.select == "events":
             rows = choose_most_distant(np.stack([self.count_events(self.biased_of(pair)) for pair in able]), wanted)
         else:
-            rows = choose_most_diverse(np.stack([self.count_events(pair) for pair in able]), wanted)
+            rows = choose_most_diverse(np.stack([self.count_response(pair) for pair in able]), wanted)
         return [able[row] for row in rows]
 
     def rank_pairs(self) -> tuple[list[int], list[int]]:
@@ -172,6 +173,13 @@ class HspTraining(RllibTraining):
         """(F,) mean counts of an episode of one of RLlib's policies, in its pair; 0 where nobody counted."""
         habits = self.algorithm.played.habits.get(trained)
         return np.zeros(len(self.names)) if habits is None else habits * self.spec.horizon
+
+    def count_response(self, pair: int) -> np.ndarray:
+        """(F,) mean counts of BR-Div's kinds by a pair's partner, over both seats. Every dish pays the same, so that
+        deliveries stand for the reward too."""
+        counts = dict(zip(self.names, self.count_events(pair), strict=True))
+        kinds = BR_DIV_EVENTS if "delivery" in counts else self.names
+        return np.array([counts["delivery" if name == SPARSE_REWARD else name] for name in kinds])
 
     def _describe_events(self, trained: int) -> dict[str, float]:
         counts = self.count_events(trained)

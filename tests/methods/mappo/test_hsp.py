@@ -11,6 +11,7 @@ from support.stand_in_mappo import StandInMappo
 
 from popgen.config.run_config import RunConfig
 from popgen.envs import make_env
+from popgen.envs.player_events import BR_DIV_EVENTS, SPARSE_REWARD
 from popgen.methods.mappo import train as module
 from popgen.methods.mappo.hsp import HspTraining, level_totals
 from popgen.methods.mappo.play_record import Counted
@@ -81,6 +82,15 @@ def test_where_too_few_deliver_the_best_of_the_rest_are_kept(monkeypatch: pytest
     training = make_training(monkeypatch, 6, {1: 0.0, 2: 0.05, 3: 9.0, 4: 0.0, 5: 0.04})
     training.algorithm.told = {**training.algorithm.told, 4: ()}  # type: ignore[attr-defined]
     assert chosen_of(training) == [2, 3, 5] and training.rank_pairs() == ([3], [2, 5, 1, 4])
+
+
+def test_responses_are_compared_by_the_kinds_of_br_div(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moves and idle interacts are none of them; deliveries stand for the reward beside themselves."""
+    training = make_training(monkeypatch, 4, {1: 9.0, 2: 8.0, 3: 11.0}, method="bp", select="responses")
+    counts = dict.fromkeys(training.names, 1.0) | {"delivery": 7.0, "MOVEMENT": 300.0, "IDLE_MOVEMENT": 40.0}
+    monkeypatch.setattr(training, "count_events", lambda pair: np.array(list(counts.values())))
+    found = dict(zip(BR_DIV_EVENTS, training.count_response(1), strict=True))
+    assert found == dict.fromkeys(BR_DIV_EVENTS, 1.0) | {"delivery": 7.0, SPARSE_REWARD: 7.0}
 
 
 def test_what_was_dropped_is_said_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
