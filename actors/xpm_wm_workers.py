@@ -54,6 +54,8 @@ from popgen.types import Kind, Weights
 BUFFERS = ("replay_sp", "replay_xp")
 CHUNK = 25
 """Updates whose batches are drawn in one call."""
+EXCHANGED = ("event_recall_step1", "exact_step1")
+"""Figures that are reported of windows with exchanged players too."""
 FIT_WINDOWS = 256
 """Windows of kept data to which partners are fitted, beside as many of the member's own."""
 
@@ -164,8 +166,8 @@ class WorldModelActor:
         return FittedPartners({member: weights_of(actor) for member, actor in actors.items()}, figures)
 
     def report(self) -> dict[str, float]:
-        """Event precision and recall at one step and open loop, exact observations: on fresh windows, and on the same
-        with the players exchanged (`exchanged/NAME`), of which the model may know nothing."""
+        """Event precision and recall at one step and open loop, exact observations: on fresh windows; and some of it on
+        the same with the players exchanged (`exchanged/NAME`), of which the model may know nothing."""
         length = self.config.world_model.length
         parts = self._draw_windows(model_batch(self.config, self.member), length + OPEN_LOOP, 4)
         windows = join([part for update in parts for part in update if part is not None])
@@ -173,7 +175,7 @@ class WorldModelActor:
         before = generator.get_state()
         other = model_report(self.learner, exchange_players(windows), context=length)
         generator.set_state(before)  # what is only looked at changes no training
-        return figures | {f"exchanged/{name}": value for name, value in other.items()}
+        return figures | {f"exchanged/{name}": other[name] for name in EXCHANGED if name in other}
 
     def weights(self) -> Pending[Weights]:
         """The whole world model, in the store."""

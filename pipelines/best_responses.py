@@ -49,6 +49,12 @@ class ResponseTraining:
     scale: str = "laptop"
     settings: Mapping[str, Any] = field(default_factory=dict)
 
+    @staticmethod
+    def of_words(words: Sequence[tuple[str, Any]]) -> ResponseTraining:
+        """Of (field, value) as they are given; `scale` among them names the recipe."""
+        settings = dict(words)
+        return ResponseTraining(str(settings.pop("scale", ResponseTraining.scale)), settings)
+
     def digest(self, environment: EnvironmentInfo) -> str:
         """sha256 of all settings that decide the result in an environment, whatever recipe or word gave them.
 

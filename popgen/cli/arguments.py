@@ -175,3 +175,17 @@ def add_config_dir(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="your own presets, such as DIR/scale/NAME.yaml or DIR/env/NAME.yaml",
     )
+
+
+def add_response_options(parser: argparse.ArgumentParser) -> None:
+    """Where best responses lie, and how they are trained."""
+    parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
+    parser.add_argument(
+        *("--response-set",),
+        nargs="+",
+        action="extend",
+        type=pair,
+        default=[],
+        metavar="KEY=VALUE",
+        help="settings of their training, such as scale=demo",
+    )

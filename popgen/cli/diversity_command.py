@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from popgen.cli.arguments import add_command, at_least, named_path, pair, share_of_one
+from popgen.cli.arguments import add_command, add_response_options, at_least, named_path, share_of_one
 from popgen.cli.printing import OK, print_json, print_report
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
@@ -28,16 +28,7 @@ def add(commands: Any) -> None:
         *("populations",), metavar="[NAME=]POPULATION", nargs="+", type=named_path, help="partners, of one environment"
     )
     parser.add_argument("--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them")
-    parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
-    parser.add_argument(
-        *("--response-set",),
-        nargs="+",
-        action="extend",
-        type=pair,
-        default=[],
-        metavar="KEY=VALUE",
-        help="settings that they were trained with, such as scale=demo",
-    )
+    add_response_options(parser)
     parser.add_argument("--episodes", type=at_least(2), default=20, help="for each partner and seat (%(default)s)")
     parser.add_argument(
         "--kernel", type=share_of_one, default=0.5, help="TrajeDi's: 0 compares actions, 1 episodes (%(default)s)"
@@ -64,8 +55,7 @@ def measure(args: argparse.Namespace) -> int:
     if args.choose is not None and args.choose > len(players):
         raise UserError("--choose", f"is {args.choose}, there are {len(players)} partners", "choose fewer")
     check_root(Path(args.out), 16 * 2**20, "--out")
-    environment, settings = opened.environment, dict(args.response_set)
-    training = ResponseTraining(str(settings.pop("scale", "laptop")), settings)
+    environment, training = opened.environment, ResponseTraining.of_words(args.response_set)
     found = find_responses(groups, args.responses, training, environment)
     responses = [found[player.identity or ""].player for player in players if (player.identity or "") in found]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from popgen.cli.arguments import add_command, at_least, named_path, numbers, pair
+from popgen.cli.arguments import add_command, add_response_options, at_least, named_path, numbers, pair
 from popgen.cli.printing import OK, print_json, print_report
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
@@ -57,7 +57,10 @@ def add(commands: Any) -> None:
         "--human", metavar=_NAMED, nargs="+", action="extend", type=named_path, help="human proxies as partners"
     )
     parser.add_argument("--control", metavar="NAME", help="an ego over which the others' margins are told")
-    _add_responses(parser)
+    parser.add_argument(
+        "--best-responses", action="store_true", help="train the best responses that are missing to all partners first"
+    )
+    add_response_options(parser)
     told = f"per ordered pair ({MATRIX_EPISODES}), or per ego, partner and seat ({HOLDOUT_EPISODES})"
     parser.add_argument("--episodes", type=at_least(1), default=None, help=told)
     parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation (%(default)s)")
@@ -66,22 +69,6 @@ def add(commands: Any) -> None:
     parser.add_argument("--env", metavar="NAME", help="refuse a population that was trained in another environment")
     parser.add_argument(
         "--param", type=pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
-    )
-
-
-def _add_responses(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--best-responses", action="store_true", help="train the best responses that are missing to all partners first"
-    )
-    parser.add_argument("--responses", metavar="DIR", help="of best responses (best_responses beside each population)")
-    parser.add_argument(
-        *("--response-set",),
-        nargs="+",
-        action="extend",
-        type=pair,
-        default=[],
-        metavar="KEY=VALUE",
-        help="settings of their training, such as scale=demo",
     )
 
 
@@ -181,8 +168,7 @@ def _train_responses(
     """The same players with the best responses to the partners, trained first where that is asked for."""
     from popgen.pipelines.best_responses import ResponseTraining, count_others, find_responses, train_responses
 
-    settings = dict(args.response_set)
-    training = ResponseTraining(str(settings.pop("scale", "laptop")), settings)
+    training = ResponseTraining.of_words(args.response_set)
     where = (casting.partners, args.responses, training, environment)
     if args.best_responses:
         train_responses(*where, reporter)

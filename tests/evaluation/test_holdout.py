@@ -162,10 +162,12 @@ def test_a_partner_with_a_reference_in_one_seat_counts_there(result: HoldoutResu
     one = describe_standing(changed, result.casting.egos[0], PartnerSet("idle", (2,)))
     assert one.referenced == 1 and one.br_prox.value == pytest.approx((1.0 + 0.0) / 2)
     assert one.br_prox_unclipped == pytest.approx((60 / 50 + 0.0) / 2)
-    assert any("1 of 4 partners have no reference that scores in one of the seats" in note for note in _notes(changed))
+    assert any(
+        "1 of 4 partners have no reference that scores in one of the seats" in note for note in list_notes(changed)
+    )
 
 
-def _notes(result: HoldoutResult) -> list[str]:
+def list_notes(result: HoldoutResult) -> list[str]:
     return to_dict(result)["notes"]
 
 

@@ -37,7 +37,7 @@ def test_dependent_partners_have_no_determinant_by_rounding_either() -> None:
     assert (found.rank, found.determinant, found.log_determinant) == (4, 0.0, -math.inf)
     assert 1.0 <= found.effective_rank <= 4.0
     four = measure_diversity(events[:4])
-    assert four.rank == 4 and four.log_determinant == pytest.approx(np.linalg.slogdet(_gram(events[:4]))[1])
+    assert four.rank == 4 and four.log_determinant == pytest.approx(np.linalg.slogdet(compute_gram(events[:4]))[1])
     assert measure_diversity(np.zeros((3, 2))).rank == 0
 
 
@@ -47,7 +47,7 @@ def test_near_collinear_partners_that_differ_keep_their_determinant() -> None:
     assert found.rank == 2 and found.determinant == pytest.approx(1e-10, rel=1e-4)
 
 
-def _gram(events: np.ndarray) -> np.ndarray:
+def compute_gram(events: np.ndarray) -> np.ndarray:
     scaled = events / (events.max(0) + 1e-3)
     return scaled @ scaled.T
 
