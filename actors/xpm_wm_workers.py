@@ -225,12 +225,13 @@ class AgentActor:
         self.learner.partner_scores = dict(task.partner_scores)
         self.learner.self_play_has_begun = task.self_play_has_begun
         self.learner.constraint.multipliers = dict(task.multipliers)
+        self.learner.pay_limits.most = task.pay_limits
         rates: dict[str, float] = {} if fitted is None else dict(fitted.figures)
         if task.tally is not None:
             recent = None if task.recent is None else task.recent.result()
             rates |= self.learner.compare_with_real_play(task.tally, recent)
         for _ in range(task.updates):
-            figures.add(self.learner.update())
+            figures.add(self.learner.update() | self.learner.pay_limits.figures())
         means = figures.means() | rates | figures.times(task.updates)
         acting, critics = self.acting_weights(model), weights_of(self.learner.critics)
         return AgentUpdate(MemberWeights(self.transport.put(acting), self.transport.put(critics), task.model), means)
@@ -269,7 +270,7 @@ class XpmWmWorkers:
     """See `popgen.methods.xpm_wm.workers.Workers`."""
 
     def __init__(self, config: WorldModelRun, attempt: str, transport: Transport) -> None:
-        self.transport, self.attempt = transport, attempt
+        self.transport, self.attempt, self.horizon = transport, attempt, config.agent.horizon
         cluster, seed, start = config.cluster, config.run.seed * 1000, transport.start
         self.pool = start_samplers(config, attempt, transport)
         place, capacity = Place(cluster.replay_cpus), config.replay.capacity
@@ -346,6 +347,10 @@ class XpmWmWorkers:
     def tally(self, member: int) -> Pending[Tally]:
         """Ask B_SP what it has taken in."""
         return self.replays["replay_sp"].ask(ReplayActor.tally, member)
+
+    def most_paid(self) -> Pending[np.ndarray]:
+        """Ask B_SP for the most that its steps on end have earned."""
+        return self.replays["replay_sp"].ask(ReplayActor.most_paid, self.horizon)
 
     def cache_starts(self) -> Pending[Starts]:
         """Ask the world-model learner for start states."""

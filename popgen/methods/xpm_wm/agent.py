@@ -34,6 +34,7 @@ from popgen.methods.xpm_wm.imagination import (
     Imagined,
     ImaginedPlay,
     JointActor,
+    PayLimits,
     Samples,
     cross_play_seats,
     draw_start_rows,
@@ -314,6 +315,7 @@ class AgentLearner:
         self.discovery = Discovery(discovery or DiscoveryConfig(), spec, model_config.view, self.device)
         self.partners: dict[int, Actor] = {}
         self.starts: Starts | None = None
+        self.pay_limits = PayLimits()
         self.partner_scores: dict[int, float] = {}
         self.imagined_scores: dict[int, float] = {}
         self.constraint = PartnerConstraint(config.xp_limit, config.multiplier_step)
@@ -398,11 +400,10 @@ class AgentLearner:
         """A batch of imagined self-play and, with a partner, of cross-play."""
         if self.starts is None:
             raise RuntimeError("set_starts before update")
-        config = self.config
-        rows = draw_start_rows(config, self.starts, self.new_share, partner, self.rng)
-        seats = cross_play_seats(config.starts_xp if partner is not None else 0, self.device)
+        rows = draw_start_rows(self.config, self.starts, self.new_share, partner, self.rng)
+        seats = cross_play_seats(self.config.starts_xp if partner is not None else 0, self.device)
         other = self.partners[partner] if partner is not None and len(seats) else None
-        act = joint_actor(self.networks.rollout_actor, other, config.starts_sp, seats, self.generator)
+        act = joint_actor(self.networks.rollout_actor, other, self.config.starts_sp, seats, self.generator)
         return ImaginedPlay(self._imagine(act, rows), seats)
 
     def start_states(self, rows: np.ndarray) -> Latent:
@@ -411,9 +412,9 @@ class AgentLearner:
         return start_latents(self.starts, rows, self.model_config.classes, self.device, self.dtype)
 
     def _imagine(self, act: JointActor, rows: np.ndarray) -> Imagined:
-        start = self.start_states(rows)
         pay = self.discovery.pay if self.discovery.changes_pay else expected_pay
-        return imagine(self.model, act, start, self.config.horizon, self.generator, pay)
+        imagined = imagine(self.model, act, self.start_states(rows), self.config.horizon, self.generator, pay)
+        return self.pay_limits.hold(imagined)
 
     def compare_with_real_play(self, tally: Tally, recent: Starts | None) -> dict[str, float]:
         """Take in what real play has shown; how often each event happens in it and in imagination from `recent`

@@ -9,6 +9,7 @@ from pydantic import Field, StrictBool, model_validator
 from popgen.config.cross_play_options import CrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
+    AddedLater,
     Batch,
     Fraction,
     Layers,
@@ -323,6 +324,10 @@ class Phase2Config(Schema):
     plateau: NonNegative = 0
     """A member goes on after `rounds`, until so many rounds were no better than its best, to `max_rounds` at most;
     0: it goes on only while its self-play is below the target."""
+    pay_limit: Annotated[Weight, AddedLater] = 0.0
+    """An imagined trajectory ends, unpaid, with a step after which its last 1, 2, ... steps would have earned more than
+    so many times the most that as many steps of real play have; 0: with none. What no play has shown is worth nothing
+    then, and values cannot run away with what the world model makes up."""
     cache: Positive = 8192
     """States from which one round's imagination starts, before those of the member's own data."""
     starts_random: Fraction = 0.6

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from popgen.envs.contract import EnvSpec
@@ -132,8 +132,47 @@ def imagine(
         states.append(model.step(states[-1], joint, generator))
     latent = Latent(torch.stack([s.h for s in states]), torch.stack([s.z for s in states]))
     reward, keep = pay(model, latent[1:])
-    running = torch.cat([torch.ones_like(keep[:1]), keep[:-1]]).cumprod(0)
-    return Imagined(latent, torch.stack(actions), reward, keep, running)
+    return Imagined(latent, torch.stack(actions), reward, keep, find_running(keep))
+
+
+def find_running(keep: Float[Tensor, "H B"]) -> Float[Tensor, "H B"]:
+    """Probability that an episode still runs before each step, from those that it goes on after each."""
+    return torch.cat([torch.ones_like(keep[:1]), keep[:-1]]).cumprod(0)
+
+
+def find_excessive_pay(reward: Float[Tensor, "H B"], limits: np.ndarray) -> Bool[Tensor, "H B"]:
+    """Steps with which the last 1, 2, ... steps together have earned more than `limits` (H,) says of so many."""
+    earned = torch.cat([torch.zeros_like(reward[:1]), reward.cumsum(0)])
+    excessive = torch.zeros_like(reward, dtype=torch.bool)
+    for steps, limit in enumerate(limits[: len(reward)].tolist(), 1):
+        excessive[steps - 1 :] |= earned[steps:] - earned[:-steps] > limit
+    return excessive
+
+
+class PayLimits:
+    """Holds imagination to what real play has earned.
+
+    Attributes:
+        most: (H,) what the last 1, 2, ... steps of a trajectory may earn; None: anything.
+        exceeded: share of the latest trajectories that would have earned more.
+    """
+
+    def __init__(self) -> None:
+        self.most: np.ndarray | None = None
+        self.exceeded = 0.0
+
+    def hold(self, imagined: Imagined) -> Imagined:
+        """Trajectories end with their first excessive step, which earns nothing."""
+        if self.most is None:
+            return imagined
+        excessive = find_excessive_pay(imagined.reward, self.most)
+        self.exceeded = float(excessive.any(0).float().mean())
+        reward, keep = (values.masked_fill(excessive, 0.0) for values in (imagined.reward, imagined.keep))
+        return replace(imagined, reward=reward, keep=keep, running=find_running(keep))
+
+    def figures(self) -> dict[str, float]:
+        """For the logs."""
+        return {} if self.most is None else {"excessive_pay": self.exceeded}
 
 
 # ---- a batch of self-play and cross-play -----------------------------------------------------------------------------

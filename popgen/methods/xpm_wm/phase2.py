@@ -133,12 +133,18 @@ def foresee_end(progress: LaterMemberProgress, phase: Phase2Config, most: int) -
 def make_agent_task(
     progress: LaterMemberProgress,
     phase: Phase2Config,
-    *,
     model: Pending[Weights],
     starts: Pending[Starts],
     partners: Pending[FittedPartners],
+    most_paid: np.ndarray | None,
 ) -> AgentTask:
-    """The round's task before its first update; the strongest partner so far (line 9) follows from `strength`."""
+    """The round's task before its first update; the strongest partner so far (line 9) follows from `strength`.
+
+    Args:
+        progress, phase: of the member.
+        model, starts, partners: see `AgentTask`.
+        most_paid: by real play in up to 1, 2, ... steps on end, where imagination is held to it.
+    """
     return AgentTask(
         updates=0,
         model=model,
@@ -148,7 +154,14 @@ def make_agent_task(
         partner_scores=progress.strength.scores(),
         multipliers=progress.constraint.multipliers,
         partners=partners,
+        pay_limits=None if most_paid is None else phase.pay_limit * most_paid,
     )
+
+
+def choose_later(progress: LaterMemberProgress) -> Candidate:
+    """The policy of the best round; there has been one."""
+    assert progress.best is not None
+    return progress.best
 
 
 # ---- what a round changes --------------------------------------------------------------------------------------------

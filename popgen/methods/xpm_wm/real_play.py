@@ -237,20 +237,6 @@ class Tally:
     visits: np.ndarray
     known: tuple[np.ndarray, ...]
 
-    def to_state(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        arrays = {"events": self.events, "own_events": self.own_events, "keys": self.keys, "visits": self.visits}
-        known = {str(part): values for part, values in enumerate(self.known)}
-        return arrays | {"own_steps": self.own_steps, "known": known}
-
-    @staticmethod
-    def from_state(state: dict[str, Any]) -> Tally:
-        """From `to_state()`, as it was read."""
-        names = ("events", "own_events", "keys", "visits")
-        events, own_events, keys, visits = (np.asarray(state[name], np.int64) for name in names)
-        known = tuple(np.asarray(state["known"][str(part)], np.int64) for part in range(len(state["known"])))
-        return Tally(events, own_events, int(state["own_steps"]), keys, visits, known)
-
 
 _LARGEST = 2**62
 

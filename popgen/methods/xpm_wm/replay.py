@@ -270,6 +270,19 @@ class Replay:
         self._cache.clear()
 
 
+def find_most_paid(replay: Replay, pay: np.ndarray, steps: int) -> np.ndarray:
+    """(steps,) float64: the most that up to 1, 2, ... steps on end of an episode have earned, where events pay `pay`
+    (E,)."""
+    size, stream, most = replay.size, replay.stream[: replay.size], np.zeros(steps)
+    earned = np.concatenate([[0.0], np.cumsum(replay.events[:size].sum(1, dtype=np.int64) @ pay)])
+    episode = np.cumsum(replay.first[:size])
+    for length in range(1, min(steps, size) + 1):
+        first, last = slice(0, size - length + 1), slice(length - 1, size)
+        whole = (stream[first] >= 0) & (stream[first] == stream[last]) & (episode[first] == episode[last])
+        most[length - 1] = (earned[length:] - earned[:-length])[whole].max(initial=0.0)
+    return np.maximum.accumulate(most)
+
+
 # ---- requests of several kinds of windows ----------------------------------------------------------------------------
 
 
@@ -418,6 +431,10 @@ class ReplayActor:
     def tally(self, owner: int) -> Tally:
         """Of all segments so far, with `owner` as the present member."""
         return self.keeper.tally(owner)
+
+    def most_paid(self, steps: int) -> np.ndarray:
+        """(steps,) float64: the most that up to 1, 2, ... steps on end of what is held have earned."""
+        return find_most_paid(self.replay, np.asarray(self.replay.env.spec.event_weights), steps)
 
     def state(self) -> dict[str, Any]:
         """Contents, counters and generator."""

@@ -205,8 +205,7 @@ class LaterMember:
             sampled = self.collect_real_episodes(published)  # 17, 19, 20
             self.work.add_to_buffers(sampled, self.member)  # 18, 21
             yield self.judge(published, sampled)
-        assert progress.best is not None
-        return progress.best
+        return phase2.choose_later(progress)
 
     def update_world_model(self) -> Pending[ModelUpdate] | None:
         """Lines 5 to 7; there is nothing new before the first real episodes."""
@@ -215,7 +214,8 @@ class LaterMember:
     def prepare_imagination(self) -> AgentTask:
         """What lines 8 to 10 need: the world model as it is, states to start from, partners and their strength (9)."""
         starts, model, partners = self.work.cache_starts(), self.work.model_weights(), self.work.fit_partners()
-        return phase2.make_agent_task(self.progress, self.phase, model=model, starts=starts, partners=partners)
+        most_paid = self.work.most_paid().result() if self.phase.pay_limit else None
+        return phase2.make_agent_task(self.progress, self.phase, model, starts, partners, most_paid)
 
     def learn_in_imagination(self, task: AgentTask) -> Generator[Record, bool | None, MemberWeights]:
         """Lines 8 to 15, in pieces for the progress bar: simulation (8, 10), objective (11-13), updates (14, 15)."""

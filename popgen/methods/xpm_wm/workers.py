@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+
 from popgen.envs.contract import EnvSpec
 from popgen.methods.training import Checkpoint, Pending, PolicySnapshot, Sampled, State
 from popgen.methods.xpm_wm.config import WorldModelRun
@@ -60,6 +62,7 @@ class AgentTask:
         recent: states of this member's latest self-play; None: those among `starts`.
         multipliers: of each partner's cross-play, where that is a constraint; 1 for those that are not there.
         partners: their actors on the latents of `model`; None: as they are.
+        pay_limits: (H,) the most that the last 1, 2, ... H steps of an imagined trajectory may earn; None: anything.
     """
 
     updates: int
@@ -72,6 +75,7 @@ class AgentTask:
     recent: Pending[Starts] | None = None
     multipliers: Mapping[int, float] = field(default_factory=dict[int, float])
     partners: Pending[FittedPartners] | None = None
+    pay_limits: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -125,6 +129,10 @@ class Workers(Protocol):
 
     def tally(self, member: int) -> Pending[Tally]:
         """What the self-play buffer has taken in so far, with `member` as the present one."""
+        ...
+
+    def most_paid(self) -> Pending[np.ndarray]:
+        """The most that up to 1, 2, ... steps of the self-play buffer have earned, as many as imagination has."""
         ...
 
     def cache_starts(self) -> Pending[Starts]:

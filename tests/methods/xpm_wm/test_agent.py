@@ -69,6 +69,18 @@ def split(imagined: list[Imagined]) -> Imagined:
     return Imagined(Latent(*latents), *cat)
 
 
+def test_imagined_play_is_held_to_the_limits_of_its_pay() -> None:
+    plain, bound, ended = (make_learner() for _ in range(3))
+    for learner in (bound, ended):
+        w.load_weights(learner.model, w.weights_of(plain.model))
+    bound.pay_limits.most, ended.pay_limits.most = np.full(AGENT.horizon, 1e9), np.full(AGENT.horizon, -1.0)
+    wanted, same, nothing = (learner.imagine_play(1).imagined for learner in (plain, bound, ended))
+    assert torch.equal(same.reward, wanted.reward) and torch.equal(same.running, wanted.running)
+    assert not nothing.reward.any() and not nothing.keep.any() and not nothing.running[1:].any()
+    figures = [learner.pay_limits.figures() for learner in (plain, bound, ended)]
+    assert figures == [{}, {"excessive_pay": 0.0}, {"excessive_pay": 1.0}]
+
+
 ROWS = 240
 PPO = {"surrogate": "ppo", "epochs": 2, "minibatches": 4}
 REINFORCE = {
@@ -356,7 +368,7 @@ def test_cross_play_starts_from_states_with_that_partner(
     assert {NEW_SP, NEW_XP} <= set(pools[:300])
 
 
-def teststart_states_are_the_stored_states() -> None:
+def test_start_states_are_the_stored_states() -> None:
     learner = make_learner()
     latent = learner.start_states(np.array([4, 7]))
     assert learner.starts is not None

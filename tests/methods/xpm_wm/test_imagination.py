@@ -2,10 +2,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
+from support.small import random_latent
 from torch import Tensor
 
-from popgen.methods.xpm_wm.imagination import imagine
+from popgen.methods.xpm_wm.imagination import (
+    Imagined,
+    PayLimits,
+    find_excessive_pay,
+    find_running,
+    imagine,
+)
 from popgen.methods.xpm_wm.latent_filter import Latent
 from popgen.methods.xpm_wm.world_model import WorldModel
 
@@ -49,3 +57,24 @@ def test_imagination_carries_no_gradient() -> None:
     start = Latent(torch.ones(2, 1, requires_grad=True), torch.zeros(2, 4))
     imagined = imagine(Counter(), last_digit, start, horizon=2)
     assert not imagined.reward.requires_grad and not imagined.latent.h.requires_grad
+
+
+def test_pay_is_excessive_where_some_last_steps_together_are_beyond_their_limit() -> None:
+    reward = torch.tensor([[4.0, 0.0, 0.0], [0.0, 3.0, 0.0], [2.0, 3.0, 9.0], [0.0, 0.0, 0.0]])
+    excessive = find_excessive_pay(reward, np.array([4.0, 5.0, 5.0]))
+    # Three steps of the first column pay 6, two and three of the second, one to three of the third.
+    assert excessive.T.int().tolist() == [[0, 0, 1, 0], [0, 0, 1, 1], [0, 0, 1, 1]]
+    assert not find_excessive_pay(reward, np.zeros(0)).any()
+
+
+def test_a_trajectory_ends_unpaid_with_its_first_excessive_step() -> None:
+    reward = torch.tensor([[3.0, 3.0], [3.0, 0.0], [0.0, 3.0], [3.0, 1.0]])
+    keep, actions = torch.full((4, 2), 0.5), torch.zeros(4, 2, 2, dtype=torch.long)
+    imagined, limits = Imagined(random_latent(5, 2), actions, reward, keep, find_running(keep)), PayLimits()
+    assert limits.hold(imagined) is imagined and limits.figures() == {}
+    limits.most = np.array([3.0, 5.0, 6.0])
+    ended = limits.hold(imagined)
+    assert ended.reward.T.tolist() == [[3.0, 0.0, 0.0, 3.0], [3.0, 0.0, 3.0, 1.0]]
+    assert ended.keep.T.tolist() == [[0.5, 0.0, 0.5, 0.5], [0.5] * 4]
+    assert ended.running.T.tolist() == [[1.0, 0.5, 0.0, 0.0], [1.0, 0.5, 0.25, 0.125]]
+    assert limits.figures() == {"excessive_pay": 0.5}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from popgen.methods.xpm_wm.replay import KIND_CODE, Query, Replay, Request, draw, join
+from popgen.methods.xpm_wm.replay import KIND_CODE, Query, Replay, Request, draw, find_most_paid, join
 from popgen.types import RANDOM_MEMBER, Kind, Segment
 
 EVENTS = 3
@@ -265,6 +265,32 @@ def test_windows_before_events_end_a_few_steps_before_one() -> None:
         assert hits
         steps_ahead.append(hits[0] + 1)
     assert set(steps_ahead) == set(range(1, reach + 1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_most_that_steps_on_end_have_earned_is_that_of_all_windows_of_episodes(seed: int) -> None:
+    history, pay = History(seed), np.arange(1.0, 1.0 + EVENTS)
+    for _ in range(12):
+        history.random_segment()
+    wanted = np.zeros(6)
+    for segment, _ in history.segments:
+        for env in range(segment.reward.shape[1]):
+            ends = np.flatnonzero(segment.terminated[:, env] | segment.truncated[:, env]) + 1
+            for episode in np.split(segment.events[:, env].sum(1) @ pay, ends):
+                for begin in range(len(episode)):
+                    for steps in range(1, 7):
+                        wanted[steps - 1] = max(wanted[steps - 1], episode[begin : begin + steps].sum())
+    assert find_most_paid(filled(history, 5000), pay, 6).tolist() == pytest.approx(wanted.tolist())
+    assert find_most_paid(Replay(Numbers(), 10, 0), pay, 2).tolist() == [0.0, 0.0]  # type: ignore[arg-type]
+
+
+def test_what_was_overwritten_pays_no_more() -> None:
+    history = History(0, ends=(0.0, 0.0))
+    for number in range(3):
+        segment, _ = history.segment(10, 1, 1, (1, 1), Kind.SP)
+        segment.events[:] = number == 0
+    assert find_most_paid(filled(history, 30), np.ones(EVENTS), 3).tolist() == [2.0 * EVENTS * n for n in (1, 2, 3)]
+    assert not find_most_paid(filled(history, 20), np.ones(EVENTS), 3).any()
 
 
 def test_too_short_streams_are_told() -> None:
