@@ -10,6 +10,8 @@ _CHANCE = "chance must find the first soups, and better ways later (docs/notes/l
 _FORCED = "docs/notes/learning.md, Later members in forced_coordination"
 _CRAMPED = f"its populations of eight were trained so ({_FORCED})"
 _FALSE_DELIVERIES = "imagined deliveries must not outnumber real ones (docs/notes/learning.md, The counter circuit)"
+_MADE_UP = "made-up deliveries are not worth having (docs/notes/learning.md, A delivery in every step)"
+_NO_LIMIT = because(0.0, "its published populations were trained without; to be trained anew")
 _DREAMER = "DreamerV3's (Hafner et al. 2025), which the paper builds on; its table has none"
 _NEVER = "never reached: the table's steps are what is run"
 
@@ -38,6 +40,7 @@ LAPTOP = Recipe(
         "phase2.rounds": because(14, "they are at two thirds of their dishes after eight rounds, at all after twelve"),
         "phase2.max_rounds": because(16, "a member that is still weak by then gets some more"),
         "phase2.plateau": because(2, "so does one that still improves"),
+        "phase2.pay_limit": because(1.25, _MADE_UP),
         "phase2.model_lag": because(1, "the second core works (docs/notes/learning.md, A model that lags)"),
     },
     {
@@ -48,10 +51,12 @@ LAPTOP = Recipe(
             "phase2.first_updates": because(100, _CRAMPED),
             "phase2.starts_new": because(0.5, _CRAMPED),
             "phase2.discount": because(None, _CRAMPED),
+            "phase2.pay_limit": _NO_LIMIT,
             "phase2.rounds": because(8, "members are at 10 dishes by then"),
             "phase2.max_rounds": 9,
         },
         "overcooked/coordination_ring": {
+            "phase2.pay_limit": _NO_LIMIT,
             "phase2.model_lag": because(0, "measured so (docs/notes/learning.md, What holds later members back)"),
         },
         "overcooked/forced_coordination": {
