@@ -15,7 +15,7 @@ from popgen.reports.reproduction.target_records import Record
 from popgen.reports.reproduction.target_registry import TARGETS
 
 FORMAT, VERSION = "popgen-reproduction", 1
-MOST_BYTES = 50_000
+MOST_BYTES = 100_000
 """Of a record."""
 
 WIDTH = 100
