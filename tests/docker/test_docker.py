@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -298,7 +299,8 @@ def test_the_entrypoint_of_the_rayjob_is_a_run_that_its_cluster_can_hold() -> No
 
 
 def entry(*words: str, path: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
-    known = {"PATH": f"{path}:{os.environ['PATH']}" if path else os.environ["PATH"], "HOME": "/nonexistent"}
+    places = [*([str(path)] if path else []), str(Path(sys.executable).parent), os.environ["PATH"]]  # it has a `python`
+    known = {"PATH": ":".join(places), "HOME": "/nonexistent"}
     return subprocess.run([ENTRY, *words], env=known | environment, capture_output=True, text=True, timeout=60)
 
 
