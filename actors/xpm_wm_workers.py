@@ -270,7 +270,7 @@ class XpmWmWorkers:
     """See `popgen.methods.xpm_wm.workers.Workers`."""
 
     def __init__(self, config: WorldModelRun, attempt: str, transport: Transport) -> None:
-        self.transport, self.attempt, self.horizon = transport, attempt, config.agent.horizon
+        self.config, self.transport, self.attempt = config, transport, attempt
         cluster, seed, start = config.cluster, config.run.seed * 1000, transport.start
         self.pool = start_samplers(config, attempt, transport)
         place, capacity = Place(cluster.replay_cpus), config.replay.capacity
@@ -350,7 +350,7 @@ class XpmWmWorkers:
 
     def most_paid(self) -> Pending[np.ndarray]:
         """Ask B_SP for the most that its steps on end have earned."""
-        return self.replays["replay_sp"].ask(ReplayActor.most_paid, self.horizon)
+        return self.replays["replay_sp"].ask(ReplayActor.most_paid, self.config.discovery, self.config.agent.horizon)
 
     def cache_starts(self) -> Pending[Starts]:
         """Ask the world-model learner for start states."""

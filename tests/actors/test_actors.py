@@ -11,7 +11,7 @@ from popgen.actors.samplers import SamplerActor
 from popgen.config.sections import EnvConfig
 from popgen.methods.training import InlineTransport, PolicySnapshot, Ready
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
-from popgen.methods.xpm_wm.config import AgentConfig, WorldModelConfig
+from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig, WorldModelConfig
 from popgen.methods.xpm_wm.replay import Query, ReplayActor, Request
 from popgen.play.rollout import Match
 from popgen.types import RANDOM_MEMBER, Kind
@@ -39,6 +39,18 @@ def test_a_restored_replay_actor_draws_the_same_and_knows_what_it_has() -> None:
     for one, two in zip(*(each.draw(requests, 5, "features", 2) for each in (replay, restored)), strict=True):
         assert one[1] is two[1] is None and one[0] is not None and two[0] is not None
         assert all(np.array_equal(getattr(one[0], name), getattr(two[0], name)) for name in vars(one[0]))
+
+
+def test_what_steps_on_end_have_earned_is_told_at_the_pay_of_imagination() -> None:
+    segment, spec = random_play(kitchen(3), 10)[0], kitchen().spec
+    segment.events[:] = 0
+    segment.events[4, 1, 0, 0] = segment.events[5, 1, 1, 3] = 1
+    replay = ReplayActor(ENV, 1000, seed=0)
+    replay.ingest(Ready([segment]), 1)
+    first, soup = spec.event_weights[0], spec.event_weights[3]
+    assert replay.most_paid(DiscoveryConfig(), 2).tolist() == [soup, first + soup]
+    doubled = DiscoveryConfig(event_factors={spec.event_names[3]: 2.0})
+    assert replay.most_paid(doubled, 2).tolist() == [2.0 * soup, first + 2.0 * soup]
 
 
 def test_segment_numbers_continue_over_matches_and_segments_are_handed_on_by_kind() -> None:

@@ -4,7 +4,8 @@ it, and what is believed.
 The rollout is Algorithm 1's lines 8 and 10. `Discovery` is for tasks where a reward lies behind a long chain of events
 that play does not show yet (docs/notes/learning.md, The counter circuit): a bonus for states of a player that real play
 has hardly seen, events that count only as far as they happen in reality as often as in imagination, and trajectories
-that end where the model has seen too little to go on.
+that end where the model has seen too little to go on. `PayLimits` holds later members to what real play has earned (A
+delivery in every step, in the same notes).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.xpm_wm.actor_critic import Actor
 from popgen.methods.xpm_wm.config import AgentConfig, DiscoveryConfig
 from popgen.methods.xpm_wm.latent_filter import Latent, from_indices
-from popgen.methods.xpm_wm.real_play import Tally, part_weights
+from popgen.methods.xpm_wm.real_play import Tally, event_pay, part_weights
 from popgen.methods.xpm_wm.replay import NEW_SP, NEW_XP, OLD
 from popgen.methods.xpm_wm.world_model import PlayerDecoder, Starts, WorldModel
 
@@ -347,8 +348,7 @@ class Discovery:
 
     def __init__(self, config: DiscoveryConfig, spec: EnvSpec, view: str, device: torch.device) -> None:
         self.config, self.spec, self.view, self.device = config, spec, spec.views[view], device
-        factors = [config.event_factors.get(name, 1.0) for name in spec.event_names]
-        self.weights = np.asarray(spec.event_weights, np.float64) * factors
+        self.weights = event_pay(config, spec)
         self.highest_paying = find_highest_paying(spec)
         self.tally: Tally | None = None
         self.shares = np.ones(spec.num_events)

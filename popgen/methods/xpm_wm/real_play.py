@@ -313,6 +313,11 @@ class TallyKeeper:
         self.known = [set(map(int, part)) for part in state["known"]]
 
 
+def event_pay(config: DiscoveryConfig, spec: EnvSpec) -> np.ndarray:
+    """(E,) float64: what each event pays in imagination."""
+    return np.asarray(spec.event_weights, np.float64) * [config.event_factors.get(n, 1.0) for n in spec.event_names]
+
+
 def goes_by_tally(config: DiscoveryConfig) -> bool:
     """Whether anything depends on what real play has shown."""
     return bool(config.count_bonus or config.found_events or config.rare_events or config.trust)

@@ -16,8 +16,8 @@ from popgen.config.sections import EnvConfig
 from popgen.envs import make_env
 from popgen.envs.contract import BatchedEnv, EnvSpec
 from popgen.methods.training import Pending
-from popgen.methods.xpm_wm.config import WorldModelRun
-from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper
+from popgen.methods.xpm_wm.config import DiscoveryConfig, WorldModelRun
+from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper, event_pay
 from popgen.types import Kind, Segment
 
 KIND_CODE = {kind: code for code, kind in enumerate(Kind)}
@@ -432,9 +432,10 @@ class ReplayActor:
         """Of all segments so far, with `owner` as the present member."""
         return self.keeper.tally(owner)
 
-    def most_paid(self, steps: int) -> np.ndarray:
-        """(steps,) float64: the most that up to 1, 2, ... steps on end of what is held have earned."""
-        return find_most_paid(self.replay, np.asarray(self.replay.env.spec.event_weights), steps)
+    def most_paid(self, discovery: DiscoveryConfig, steps: int) -> np.ndarray:
+        """(steps,) float64: the most that up to 1, 2, ... steps on end of what is held have earned, at the pay of
+        imagination."""
+        return find_most_paid(self.replay, event_pay(discovery, self.replay.env.spec), steps)
 
     def state(self) -> dict[str, Any]:
         """Contents, counters and generator."""
