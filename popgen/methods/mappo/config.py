@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from popgen.config.cross_play_options import PaidCrossPlayOptions
 from popgen.config.run_config import RunConfig
 from popgen.config.schema import (
+    AddedLater,
     Batch,
     Fraction,
     Layers,
@@ -155,6 +156,8 @@ class TrajediConfig(Schema):
 
     alpha: Weight = 0.1
     """Reward for each nat of divergence of a step, as of the action that makes it (the paper's alpha); 0 is MAPPO."""
+    warmup: Annotated[NonNegative, AddedLater] = 0
+    """Iterations over which alpha rises in a straight line from 0; 0: full weight at once."""
     kernel: Fraction = 0.5
     """Weight of a step's neighbour beside the step's own (the paper's gamma): 0 compares single actions, 1 all that an
     iteration has of an episode (`ppo.steps` at most)."""

@@ -33,7 +33,8 @@ CHUNK = 8192
 @dataclass(frozen=True)
 class Plan:
     """What a member is trained on in one iteration: its own play, cross-play and mixed play with one partner, and
-    cross-play with `others`. Its own play is with itself unless `mate` has the other seat."""
+    cross-play with `others`. Its own play is with itself unless `mate` has the other seat. `bonus` is the share of the
+    job's bonus that self-play is paid."""
 
     partner: int | None = None
     lambda_xp: float = 0.0
@@ -42,6 +43,7 @@ class Plan:
     xp_floor: float | None = None
     mate: int | None = None
     others: tuple[int, ...] = ()
+    bonus: float = 1.0
 
     def sources(self, member: int) -> list[tuple[Kind, int, float]]:
         """(kind, partner, weight), self-play first."""
@@ -276,7 +278,7 @@ def _change_reward(
         reward = utility.pay(reward, played.events)
         figures["utility"] = float(reward.mean())
     if kind is Kind.SP and bonus is not None:
-        extra = bonus(played.steps)
+        extra = plan.bonus * bonus(played.steps)
         figures["bonus"] = float(extra.mean())
         reward = reward + extra
     return replace(played, steps=replace(played.steps, reward=reward))

@@ -15,8 +15,8 @@ from popgen.reports.reproduction.target_records import Record
 from popgen.reports.reproduction.target_registry import TARGETS
 
 FORMAT, VERSION = "popgen-reproduction", 1
-MOST_BYTES = 100_000
-"""Of a record."""
+MOST_BYTES = 250_000
+"""Of a record: all generators and their egos on five layouts."""
 
 WIDTH = 100
 

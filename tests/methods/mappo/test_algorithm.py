@@ -158,6 +158,15 @@ def test_lambda_rises_and_stays(comedi: Mappo) -> None:
     assert found == pytest.approx([0.0625, 0.125, 0.1875, 0.25, 0.25, 0.25])
 
 
+def test_a_bonus_rises_and_stays() -> None:
+    """Over four iterations, or at once."""
+    found = {
+        warmup: [PlayRecord(Job(ENV, PPO, None, (1,), seed=0, bonus_warmup=warmup)).plan(1, n).bonus for n in range(5)]
+        for warmup in (0, 4)
+    }
+    assert found == {0: [1.0] * 5, 4: [0.25, 0.5, 0.75, 1.0, 1.0]}
+
+
 def test_all_members_meet_all_others(solo: Mappo) -> None:
     algorithm = build(Job(ENV, PPO, CROSS, (1, 2, 3), seed=4))
     try:

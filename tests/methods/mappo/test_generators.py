@@ -50,12 +50,14 @@ def test_log_probs_are_those_of_each_members_actor_at_each_seat() -> None:
 
 @pytest.mark.parametrize("bonus", [SurpriseBonus(0.3, 1e-5), DivergenceBonus(0.3, 0.5)])
 def test_a_bonus_is_a_reward_before_advantages(bonus: Any) -> None:
-    """The batch equals that of a rollout whose reward had the bonus in it; a weight of zero changes nothing."""
+    """The batch equals that of a rollout whose reward had the plan's share of the bonus in it."""
     nets = actors(3)
-    paid = bonus(joint_log_probs(self_play(), 2, nets))
+    whole = bonus(joint_log_probs(self_play(), 2, nets))
+    paid = 0.25 * whole
     assert paid.shape == self_play().reward.shape and float(paid.abs().sum()) > 0
     richer = rollout(7, sp(2), reward=(self_play().reward + paid).numpy())
-    by_bonus = pool([rollout(7, sp(2))], 2, Plan(), {"SP": reads_observation()}, VIEW, bonus=lambda _: paid, **OPTIONS)
+    plan = Plan(bonus=0.25)
+    by_bonus = pool([rollout(7, sp(2))], 2, plan, {"SP": reads_observation()}, VIEW, bonus=lambda _: whole, **OPTIONS)
     by_reward = pool([richer], 2, Plan(), {"SP": reads_observation()}, VIEW, **OPTIONS)
     assert by_bonus is not None and by_reward is not None
     torch.testing.assert_close(by_bonus.advantage, by_reward.advantage)
