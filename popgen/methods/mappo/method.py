@@ -36,6 +36,7 @@ from popgen.methods.mappo.recipes import (
     LIPO_OBJECTIVES,
     LIPO_RECIPES,
     RECIPES,
+    TRAJEDI_RECIPES,
 )
 from popgen.methods.method import Method
 from popgen.types import SKILLS
@@ -120,7 +121,7 @@ TRAJEDI = Method(
     colour="#000000",
     marker="X",
     config=TrajediRun,
-    recipes=RECIPES,
+    recipes=TRAJEDI_RECIPES,
     training="popgen.methods.mappo.trajedi:open_training",
     actors=list_actors,
     needs=estimate_together,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from popgen.methods.recipe import Recipe, Settings, because, ours
 
 _NOTES = "docs/notes/baselines.md"
+_GENERATORS = "docs/notes/generators.md"
 _NEVER = "never reached: the steps are what is run"
 
 LAPTOP = Recipe(
@@ -212,3 +213,13 @@ BP_RECIPES = _with_pairs(
 )
 
 BRDIV_RECIPES = _with_crossed_pairs()
+
+TRAJEDI_RECIPES = {
+    base.name: Recipe(base.name, base.summary, own, base=base)
+    for base, own in (
+        (LAPTOP, {"trajedi.warmup": because(50, f"divergence before soups keeps members from soups, {_GENERATORS}")}),
+        (DEMO, {"trajedi.warmup": 50}),
+        (PAPER, {}),
+        (SMOKE, {"trajedi.warmup": 2}),
+    )
+}
