@@ -156,8 +156,9 @@ class TrajediConfig(Schema):
 
     alpha: Weight = 0.1
     """Reward for each nat of divergence of a step, as of the action that makes it (the paper's alpha); 0 is MAPPO."""
-    warmup: Annotated[NonNegative, AddedLater] = 0
-    """Iterations over which alpha rises in a straight line from 0; 0: full weight at once."""
+    full_score: Annotated[Weight, AddedLater] = 0.0
+    """Mean self-play score at which alpha has its full weight; it rises with a member's score in a straight line from
+    0; 0: full weight from the beginning."""
     kernel: Fraction = 0.5
     """Weight of a step's neighbour beside the step's own (the paper's gamma): 0 compares single actions, 1 all that an
     iteration has of an episode (`ppo.steps` at most)."""

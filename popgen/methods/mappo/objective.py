@@ -39,7 +39,7 @@ class Objective:
             played for that alone; otherwise by the episodes of training, which then has cross-play with every partner.
         together: all members learn together, though they never meet.
         bonus: a reward beside the environment's, by what the other members that learn would do.
-        bonus_warmup: iterations over which it rises in a straight line from 0.
+        bonus_score: mean self-play score at which it is paid in full; in proportion below. 0: always in full.
         noise: share of random actions of whoever has the other seat, which is the member itself; 0: plain self-play.
     """
 
@@ -47,7 +47,7 @@ class Objective:
     fresh_episodes: bool = False
     together: bool = False
     bonus: PopulationBonus | None = None
-    bonus_warmup: int = 0
+    bonus_score: float = 0.0
     noise: float = 0.0
 
     @property

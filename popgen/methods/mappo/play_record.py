@@ -111,11 +111,11 @@ class PlayRecord:
         return len(cross) == len(partners) and max(cross.values()) <= diversity.target_xp
 
     def plan(self, member: int, rounds: int) -> Plan:
-        """What a member is trained on after `rounds` iterations: lambda_XP and the bonus rise over their warm-ups. The
-        partner is the strongest or, under a constraint, drawn in proportion to the multipliers; or all share the
-        weight."""
+        """What a member is trained on after `rounds` iterations: lambda_XP rises over the first `warmup`, the bonus
+        with the member's score. The partner is the strongest or, under a constraint, drawn in proportion to the
+        multipliers; or all share the weight."""
         diversity, partners, mate = self.job.diversity, self.job.partners(member), self.job.mate_of(member)
-        bonus = linear_schedule(0.0, 1.0, rounds + 1, self.job.bonus_warmup)
+        bonus = linear_schedule(0.0, 1.0, max(0.0, self.scores(member).get("sp", 0.0)), self.job.bonus_score)
         own = Plan(mate=None if mate == member else mate, bonus=bonus)
         if diversity is None or not partners:
             return own

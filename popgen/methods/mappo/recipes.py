@@ -214,12 +214,15 @@ BP_RECIPES = _with_pairs(
 
 BRDIV_RECIPES = _with_crossed_pairs()
 
+_NO_SOUP = f"divergence before the first soups keeps members from them, {_GENERATORS}"
+_PAID_IN_FULL: Settings = {"trajedi.full_score": because(0.0, "scores are below 0 at first")}
+
 TRAJEDI_RECIPES = {
-    base.name: Recipe(base.name, base.summary, own, base=base)
-    for base, own in (
-        (LAPTOP, {"trajedi.warmup": because(50, f"divergence before soups keeps members from soups, {_GENERATORS}")}),
-        (DEMO, {"trajedi.warmup": 50}),
-        (PAPER, {}),
-        (SMOKE, {"trajedi.warmup": 2}),
+    base.name: Recipe(base.name, base.summary, own, rows, base=base)
+    for base, own, rows in (
+        (LAPTOP, {"trajedi.full_score": because(10.0, _NO_SOUP)}, {"rendezvous/mppmr": _PAID_IN_FULL}),
+        (DEMO, {"trajedi.full_score": 8.0}, {"rendezvous/mppmr": _PAID_IN_FULL}),
+        (PAPER, {}, {}),
+        (SMOKE, {}, {}),
     )
 }

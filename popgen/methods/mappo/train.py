@@ -106,7 +106,7 @@ def training_job(
         mixed=diversity is not None and objective.samples(Kind.MP, diversity),
         fresh=objective.fresh_episodes,
         bonus=objective.bonus,
-        bonus_warmup=objective.bonus_warmup,
+        bonus_score=objective.bonus_score,
         pairs={member: -member for member in learning} if objective.noise > 0.0 else {},
         noise=objective.noise,
     )

@@ -31,7 +31,7 @@ class Job:
         fresh: the strongest partner is matches by episodes of its own (CoMeDi), not by the training's.
         seed: of everything.
         bonus: added to self-play's reward.
-        bonus_warmup: iterations over which it rises in a straight line from 0.
+        bonus_score: mean self-play score at which it is paid in full; in proportion below. 0: always in full.
         pairs: learning member -> who has the other seat in its play, where that is not itself: another learning member,
             or -m for the member's own policy with random actions among its own. Beside that it also plays plainly with
             itself in some environments, which tell its score and are not learned from.
@@ -49,7 +49,7 @@ class Job:
     mixed: bool = False
     fresh: bool = False
     bonus: PopulationBonus | None = None
-    bonus_warmup: int = 0
+    bonus_score: float = 0.0
     pairs: Mapping[int, int] = field(default_factory=dict)
     utilities: Mapping[int, Utility] = field(default_factory=dict)
     noise: float = 0.0

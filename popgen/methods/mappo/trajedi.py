@@ -42,5 +42,5 @@ def open_training(config: TrajediRun, spec: EnvSpec, attempt: str, transport: Tr
     """See `popgen.methods.training.OpenTraining`."""
     settings = config.trajedi
     bonus = DivergenceBonus(settings.alpha, settings.kernel) if settings.alpha > 0.0 else None
-    objective = Objective(together=True, bonus=bonus, bonus_warmup=settings.warmup)
+    objective = Objective(together=True, bonus=bonus, bonus_score=settings.full_score)
     return open_rllib(config, spec, attempt, transport, objective)

@@ -158,13 +158,15 @@ def test_lambda_rises_and_stays(comedi: Mappo) -> None:
     assert found == pytest.approx([0.0625, 0.125, 0.1875, 0.25, 0.25, 0.25])
 
 
-def test_a_bonus_rises_and_stays() -> None:
-    """Over four iterations, or at once."""
-    found = {
-        warmup: [PlayRecord(Job(ENV, PPO, None, (1,), seed=0, bonus_warmup=warmup)).plan(1, n).bonus for n in range(5)]
-        for warmup in (0, 4)
-    }
-    assert found == {0: [1.0] * 5, 4: [0.25, 0.5, 0.75, 1.0, 1.0]}
+@pytest.mark.parametrize(("full", "shares"), [(0.0, [1.0] * 4), (8.0, [0.0, 0.25, 0.75, 1.0])])
+def test_a_bonus_rises_with_the_members_score(full: float, shares: list[float]) -> None:
+    """Without an episode, and after mean scores of 2, 6 and 10; another member's score does not count."""
+    played, found = PlayRecord(Job(ENV, PPO, None, (1, 2), seed=0, bonus_score=full)), []
+    played.own[2].append(100.0)
+    for score in (None, 2.0, 10.0, 18.0):
+        played.own[1].extend([] if score is None else [score])
+        found.append(played.plan(1, 0).bonus)
+    assert found == pytest.approx(shares)
 
 
 def test_all_members_meet_all_others(solo: Mappo) -> None:
