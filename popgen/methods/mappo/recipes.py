@@ -220,8 +220,8 @@ _PAID_IN_FULL: Settings = {"trajedi.full_score": because(0.0, "scores are below 
 TRAJEDI_RECIPES = {
     base.name: Recipe(base.name, base.summary, own, rows, base=base)
     for base, own, rows in (
-        (LAPTOP, {"trajedi.full_score": because(10.0, _NO_SOUP)}, {"rendezvous/mppmr": _PAID_IN_FULL}),
-        (DEMO, {"trajedi.full_score": 8.0}, {"rendezvous/mppmr": _PAID_IN_FULL}),
+        (LAPTOP, {"trajedi.full_score": because(3.0, _NO_SOUP)}, {"rendezvous/mppmr": _PAID_IN_FULL}),
+        (DEMO, {"trajedi.full_score": 3.0}, {"rendezvous/mppmr": _PAID_IN_FULL}),
         (PAPER, {}, {}),
         (SMOKE, {}, {}),
     )
