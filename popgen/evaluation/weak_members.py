@@ -13,6 +13,9 @@ import numpy as np
 
 from popgen.evaluation.crossplay import CrossPlayResult, Estimate
 
+NEVER_REACHED = 1000.0
+"""A target of so much or more is none: recipes set it where the steps are what ends a training."""
+
 OTHERS = 2
 """Other members that it takes to measure one by."""
 
@@ -38,7 +41,8 @@ class WeakMember:
 
 def find_weak_members(result: CrossPlayResult, targets: Mapping[int, float], share: float) -> list[WeakMember]:
     """Members whose self-play is, by more than two standard errors, below `share` of their target or of the median of
-    the others; aims that are not positive, as returns that are penalties, tell nothing.
+    the others. Aims that are not positive, as returns that are penalties, tell nothing, nor do those that are
+    `NEVER_REACHED`.
 
     Args:
         result: the evaluation.
@@ -49,7 +53,8 @@ def find_weak_members(result: CrossPlayResult, targets: Mapping[int, float], sha
     for member in result.members:
         sp = result.own_play(member)
         others = [result.own_play(other).mean for other in result.members if other != member]
-        aims = {"target": targets.get(member, 0.0)}
+        target = targets.get(member, 0.0)
+        aims = {"target": target if target < NEVER_REACHED else 0.0}
         aims["other members"] = float(np.median(others)) if len(others) >= OTHERS else 0.0
         what = max(aims, key=lambda name: aims[name])
         bound = share * aims[what]

@@ -37,6 +37,7 @@ def test_a_member_far_below_the_others_is_named() -> None:
 def test_a_member_far_below_its_target_is_named_even_alone() -> None:
     assert weak(0.5, target=10.0) == [(1, "target")] and weak(2.5, target=10.0) == []
     assert weak(0.0, 0.0, 0.0, target=10.0) == [(1, "target"), (2, "target"), (3, "target")]
+    assert weak(9.0, 9.0, 9.0, target=1000.0) == []  # a target that nobody is meant to reach
 
 
 def test_figures_that_are_uncertain_or_have_no_scale_name_nobody() -> None:

@@ -252,6 +252,7 @@ def test_fcp_keeps_a_seed_at_three_skills(root: Path) -> None:
     assert [one["skill"] for one in extra] == ["initial", "half", "final"]
     assert extra[0]["at_steps"] == 0 and extra[1]["at_steps"] in (80, 160) and extra[1]["of_member"] == 3
     assert [one["seconds"] for one in extra[:2]] == [0.0, 0.0] and "seconds" in extra[2]
+    assert extra[2]["target"] == 1_000_000.0  # by which a population is told that a member does not play
 
 
 def test_members_that_are_paid_for_diversity_learn_together(root: Path) -> None:

@@ -227,6 +227,7 @@ class RllibTraining:
         self.archive[member] = policy.weights()
         scores = algorithm.scores(number)
         extra = {**scores, "iterations": algorithm.rounds, "seconds": round(seconds / len(self.learning), 1)}
+        extra["target"] = self.config.ppo.target_score
         parts = ", ".join(f"{title_score(name)} {value:.2f}" for name, value in scores.items())
         parts = f"{parts} {self.spec.score_name}" if parts else "no whole episode"
         steps = f"{self.progress.steps[member]:,} environment steps"
