@@ -48,7 +48,8 @@ class EvaluationConfig(Schema):
     episodes: Batch = 20
     """Episodes behind each figure of the SP/XP matrix, for each pair of members in each seating."""
     weak_share: Fraction = 0.25
-    """A member does not play if its self-play is below this share of its target or of the other members' median."""
+    """A member does not play if its self-play is below this share of its target (1000 and more are none) or of the
+    other members' median."""
 
 
 class ClusterConfig(Schema):

@@ -214,15 +214,12 @@ BP_RECIPES = _with_pairs(
 
 BRDIV_RECIPES = _with_crossed_pairs()
 
-_NO_SOUP = f"divergence before the first soups keeps members from them, {_GENERATORS}"
-_PAID_IN_FULL: Settings = {"trajedi.full_score": because(0.0, "scores are below 0 at first")}
+_AFTER_SOUPS: Settings = {
+    "trajedi.full_score": because(3.0, f"divergence before the first soups keeps members from them, {_GENERATORS}")
+}
+_AT_ONCE: Settings = {"trajedi.full_score": because(0.0, "scores are below 0 at first")}
 
-TRAJEDI_RECIPES = {
-    base.name: Recipe(base.name, base.summary, own, rows, base=base)
-    for base, own, rows in (
-        (LAPTOP, {"trajedi.full_score": because(3.0, _NO_SOUP)}, {"rendezvous/mppmr": _PAID_IN_FULL}),
-        (DEMO, {"trajedi.full_score": 3.0}, {"rendezvous/mppmr": _PAID_IN_FULL}),
-        (PAPER, {}, {}),
-        (SMOKE, {}, {}),
-    )
+TRAJEDI_RECIPES = RECIPES | {
+    base.name: Recipe(base.name, base.summary, _AFTER_SOUPS, {"rendezvous/mppmr": _AT_ONCE}, base=base)
+    for base in (LAPTOP, DEMO)
 }

@@ -8,7 +8,8 @@ action adds to the parts of all steps so far (`divergence_rewards` of `losses/po
 undiscounted returns are the divergence's score-function gradient. The rest of the gradient, that of the logarithm
 itself, is left out. It vanishes in expectation over the population where whole episodes are compared (kernel 1); at
 kernel 0.5 it is 0.23 of the whole, by random members on four steps (`tests/losses/test_population_diversity.py`). The
-common best response of the paper is an ego agent.
+common best response of the paper is an ego agent. On the laptop alpha is in full only once a member plays
+(`trajedi.full_score`).
 """
 
 from __future__ import annotations
