@@ -20,8 +20,8 @@ from popgen.actors.tracker_actor import RemoteTracker
 from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
-from popgen.evaluation.crossplay import CrossPlayResult, evaluate_population
-from popgen.evaluation.weak_members import WeakMember, find_weak_members
+from popgen.evaluation.crossplay import evaluate_population
+from popgen.evaluation.weak_members import list_weak_members
 from popgen.methods.registry import METHODS
 from popgen.methods.training import InlineTransport, Training, Transport
 from popgen.pages.report_source import read_source
@@ -41,7 +41,6 @@ from popgen.runs.recorder import RunRecorder
 from popgen.runs.recovery import RetryBudget, actor_failure, first_line, nodes_alive, user_facing_error, wait_for_room
 from popgen.runs.sinks import LoggingReporter, NoTracker, TrackerClient, gauge
 from popgen.runs.storage import Mirror
-from popgen.types import FINAL_SKILL
 
 HALT_SECONDS = 30.0
 """Least time between two checkpoints where all overlapping work halts for one."""
@@ -211,8 +210,9 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     path = recorder.dir / "population"
     reporter.expect(None)  # the last phase has an estimate of its own
     reporter.phase("evaluation", 1)
+    population = load_population(path)
     result = evaluate_population(
-        load_population(path),
+        population,
         config.evaluation.episodes,
         config.run.seed,
         progress=lambda done, total: reporter.update(done / total, episodes=done),
@@ -233,7 +233,8 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     recorder.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
     recorder.tracker.describe(describe_run(source.run, list_findings(source)), describe_experiment(recorder.dir))
     evaluation = to_dict(result)
-    weak = [one.describe(spec.score_name) for one in list_weak_members(config, recorder, result)]
+    found = list_weak_members(population.members, result, config.evaluation.weak_share)
+    weak = [one.describe(spec.score_name) for one in found]
     for line in weak:
         recorder.events.write("weak", level="WARNING", text=line)
     return {
@@ -251,16 +252,6 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         "files": {suffix: str(file) for suffix, file in files.items()},
         "seconds": round(time.time() - recorder.began, 1),
     }
-
-
-def list_weak_members(config: RunConfig, recorder: RunRecorder, result: CrossPlayResult) -> list[WeakMember]:
-    """Members that do not play, by their methods' targets where there are any, and by each other; a member that is kept
-    for its lower skill (`extra.skill`) is meant to be weak, one of a pair (`extra.role`) is not meant for itself."""
-    infos = load_population(recorder.dir / "population").members
-    targets = {info.id: float(info.extra["target"]) for info in infos if "target" in info.extra}
-    meant = {one.id for one in infos if one.extra.get("skill", FINAL_SKILL) != FINAL_SKILL or "role" in one.extra}
-    found = find_weak_members(result, targets, config.evaluation.weak_share)
-    return [one for one in found if one.member not in meant]
 
 
 def find_tracked(config: RunConfig, recorder: RunRecorder) -> dict[str, str] | None:

@@ -49,7 +49,7 @@ class EvaluationConfig(Schema):
     """Episodes behind each figure of the SP/XP matrix, for each pair of members in each seating."""
     weak_share: Fraction = 0.25
     """A member does not play if its self-play is below this share of its target (1000 and more are none) or of the
-    other members' median."""
+    other members' median, or no better than beside a random partner; 0 names nobody."""
 
 
 class ClusterConfig(Schema):

@@ -33,7 +33,7 @@ PRESET = """\
 # @package _global_
 scale: quick
 population: {size: 2}
-evaluation: {episodes: 2}
+evaluation: {episodes: 2, weak_share: 0.0}
 guess: {rounds: 3}
 run: {transport: inline}
 tracking: {enabled: false}
