@@ -21,7 +21,6 @@ from popgen.config.run_config import RunConfig
 from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.evaluation.crossplay import evaluate_population
-from popgen.evaluation.weak_members import list_weak_members
 from popgen.methods.registry import METHODS
 from popgen.methods.training import InlineTransport, Training, Transport
 from popgen.pages.report_source import read_source
@@ -210,9 +209,8 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     path = recorder.dir / "population"
     reporter.expect(None)  # the last phase has an estimate of its own
     reporter.phase("evaluation", 1)
-    population = load_population(path)
     result = evaluate_population(
-        population,
+        load_population(path),
         config.evaluation.episodes,
         config.run.seed,
         progress=lambda done, total: reporter.update(done / total, episodes=done),
@@ -233,9 +231,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
     recorder.tracker.log({name: value for name, value in figures.items() if np.isfinite(value)}, step=size)
     recorder.tracker.describe(describe_run(source.run, list_findings(source)), describe_experiment(recorder.dir))
     evaluation = to_dict(result)
-    found = list_weak_members(population.members, result, config.evaluation.weak_share)
-    weak = [one.describe(spec.score_name) for one in found]
-    for line in weak:
+    for line in source.run.weak_members:
         recorder.events.write("weak", level="WARNING", text=line)
     return {
         "run_id": recorder.run_id,
@@ -247,7 +243,7 @@ def finish(config: RunConfig, spec: EnvSpec, recorder: RunRecorder, reporter: Re
         "evaluation": evaluation,
         "tracking": find_tracked(config, recorder),
         "warnings": list_warnings(evaluation),
-        "weak_members": weak,
+        "weak_members": list(source.run.weak_members),
         "findings": [finding.as_dict() for finding in list_findings(source)],
         "files": {suffix: str(file) for suffix, file in files.items()},
         "seconds": round(time.time() - recorder.began, 1),

@@ -183,6 +183,7 @@ def _describe_run(pieces: Pieces, run: WantedRun, job: Job) -> dict[str, Any]:
         "machine": piece.get("machine") or last.get("machine"),
         "taken_over": job.taken_over,
         "seconds": describe_seconds(record),
+        **({"weak_members": list(record.weak_members)} if record.weak_members else {}),
         "definitions": {name: pieces.define_measure(job, name) for name in run.measures},
         "figures": {name: pieces.read_measured(job, name) for name in run.measures},
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 from popgen.config.run_config import RunConfig
 from popgen.errors import UserError
 from popgen.progress import Reporter
-from popgen.reports.run_record import is_finished
+from popgen.reports.run_record import is_finished, read_run
 from popgen.runs.directory import describe_settings
 
 
@@ -36,7 +36,7 @@ def run_all(configs: Sequence[RunConfig], *, reporter: Reporter) -> list[Path]:
 
     Args:
         configs: validated, with root and id (`named`).
-        reporter: told of progress.
+        reporter: told of progress, and of members that do not play.
 
     Returns:
         The runs' folders, in order.
@@ -50,9 +50,12 @@ def run_all(configs: Sequence[RunConfig], *, reporter: Reporter) -> list[Path]:
         folders.append(folder)
         if is_finished(folder):
             reporter.note(f"run {number} of {len(configs)}: {folder} is finished")
-            continue
-        reporter.note(f"run {number} of {len(configs)}: {config.method} on {config.env.name}, seed {config.run.seed}")
-        from popgen.pipelines.population import run_population  # with Ray, which finished runs do without
+        else:
+            told = f"{config.method} on {config.env.name}, seed {config.run.seed}"
+            reporter.note(f"run {number} of {len(configs)}: {told}")
+            from popgen.pipelines.population import run_population  # with Ray, which finished runs do without
 
-        run_population(config, reporter=reporter)
+            run_population(config, reporter=reporter)
+        for line in read_run(folder).weak_members:
+            reporter.note(f"run {number} of {len(configs)}: {line}")
     return folders

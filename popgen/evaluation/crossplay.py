@@ -176,10 +176,6 @@ class CrossPlayResult:
         parts += [self.score(partner, m) for m in self.members] if seat in (0, None) else []
         return Estimate.average(parts)
 
-    def member_beside(self, partner: str, member: int) -> Estimate:
-        """Mean score over both seatings of one member and a `random` or `idle` partner."""
-        return Estimate.average([self.score(member, partner), self.score(partner, member)])
-
     @property
     def comparisons(self) -> tuple[Obstruction, ...]:
         """All that obstruction is judged by: members (i, j) in seats 0 and 1, no mates, against i beside the random or

@@ -1,8 +1,9 @@
-"""Networks' weights as plain numpy dictionaries, and back."""
+"""Networks' weights and optimisers: as plain numpy dictionaries and back, and the bound on a step's gradient."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -49,6 +50,11 @@ def under(prefix: str, weights: Weights) -> Weights:
     """The inverse of `prefixed` on a merged dictionary."""
     start = prefix + "."
     return {name.removeprefix(start): value for name, value in weights.items() if name.startswith(start)}
+
+
+def clip_gradients(parameters: Iterable[nn.Parameter], most: float) -> torch.Tensor:
+    """Scale the gradients down to the norm `most` where theirs is larger (0: never); the norm that they had."""
+    return nn.utils.clip_grad_norm_(parameters, most or math.inf)
 
 
 def optimiser_state(optimiser: torch.optim.Optimizer) -> dict[str, np.ndarray]:

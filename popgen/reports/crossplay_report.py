@@ -36,7 +36,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -231,6 +232,34 @@ def restate_pairs(report: Mapping[str, Any], mates: Sequence[int]) -> dict[str, 
     return {**report, "mates": own, **figures, "mixed_play": _describe_mixed(result)}
 
 
+def leave_out(report: Mapping[str, Any], members: Collection[int]) -> dict[str, Any]:
+    """The JSON object as if some members were not there, without `matrix` and `beside`.
+
+    Args:
+        report: of an evaluation.
+        members: to leave out; with none of them the report is as it was.
+    """
+    if not members:
+        return dict(report)
+    kept = [member for member in report["members"] if member not in members]
+    mates = {member: mate for member, mate in list_mates(report).items() if member in kept}
+    result = replace(_read_result(report, {m: mate for m, mate in mates.items() if m != mate}), members=tuple(kept))
+    out = {str(member) for member in members}
+    mixed = {**report["mixed_play"]}
+    for part in ("members", "cases"):
+        mixed[part] = [one for one in mixed.get(part, []) if not {one["member"], one.get("partner")} & set(members)]
+    changed = {
+        "members": kept,
+        "mates": list(mates.values()),
+        "sp": result.sp.to_dict(),
+        "xp": result.xp.to_dict(),
+        "obstruction": _describe_obstructions(result),
+        "mixed_play": mixed,
+        "pairs": [one for one in report["pairs"] if not {one["seat_0"], one["seat_1"]} & out],
+    }
+    return {key: value for key, value in report.items() if key not in ("matrix", "beside")} | changed
+
+
 def _read_result(report: Mapping[str, Any], mates: Mapping[int, int]) -> CrossPlayResult:
     """All that SP, XP and obstruction follow from."""
     return CrossPlayResult(
@@ -249,12 +278,13 @@ def _read_result(report: Mapping[str, Any], mates: Mapping[int, int]) -> CrossPl
 
 
 def _read_pairing(told: Mapping[str, Any]) -> Pairing:
-    score, reward, shaped = (_read_estimate(told[name]) for name in ("score", "reward", "shaped_return"))
+    score, reward, shaped = (read_estimate(told[name]) for name in ("score", "reward", "shaped_return"))
     seats = (told["seat_0"], told["seat_1"])
     return Pairing(seats, np.array(told.get("scores", [])), score, reward, shaped, np.array(told["events"]))
 
 
-def _read_estimate(figure: Mapping[str, float | None]) -> Estimate:
+def read_estimate(figure: Mapping[str, float | None]) -> Estimate:
+    """Of a figure of the JSON object."""
     mean, error = figure["mean"], figure["standard_error"]
     return Estimate(math.nan if mean is None else mean, math.nan if error is None else error)
 

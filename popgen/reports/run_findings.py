@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from popgen.errors import UserError
 from popgen.methods.registry import METHODS
 from popgen.reports import paper_figures as paper
 from popgen.reports.comparison import SHARE_SP, SHARE_XP
-from popgen.reports.crossplay_report import has_pairs, list_own_scores, list_warnings
+from popgen.reports.crossplay_report import has_pairs, leave_out, list_own_scores, list_warnings
 from popgen.reports.frames import number_text
 from popgen.reports.method_titles import title_of
 from popgen.reports.run_record import RunRecord, differences, read_run
@@ -44,12 +44,13 @@ class Finding:
 
 def explain_run(run: RunRecord) -> list[Finding]:
     """All that can be said of a finished run."""
-    return [*explain_scores(run.scores), *_compare_with_control(run)]
+    return [*explain_scores(leave_out(run.scores, run.unfinished), run.weak_members), *_compare_with_control(run)]
 
 
-def explain_scores(scores: Mapping[str, Any]) -> list[Finding]:
-    """What an evaluation (`popgen.reports.crossplay_report`) says by itself."""
-    return [*_judge_self_play(scores), *_judge_members(scores), *_judge_cross_play(scores), *_judge_obstruction(scores)]
+def explain_scores(scores: Mapping[str, Any], weak_members: Sequence[str] = ()) -> list[Finding]:
+    """What an evaluation (`popgen.reports.crossplay_report`) says by itself, and who of its run does not play."""
+    members = [Finding(line, False) for line in weak_members] or _judge_members(scores)
+    return [*_judge_self_play(scores), *members, *_judge_cross_play(scores), *_judge_obstruction(scores)]
 
 
 def _judge_self_play(scores: Mapping[str, Any]) -> Iterator[Finding]:

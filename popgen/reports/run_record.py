@@ -19,6 +19,7 @@ from popgen.population.manifest import EnvironmentInfo, MemberInfo
 from popgen.population.member_pairs import find_mates
 from popgen.reports.crossplay_report import restate_pairs
 from popgen.reports.training_curves import Point, read_curves, read_lines
+from popgen.reports.weak_members import is_unfinished, list_weak_members
 from popgen.runs.ledger import Ledger, LedgerConflict
 from popgen.types import Kind, LedgerEntry
 
@@ -70,6 +71,8 @@ class RunRecord:
         attempts: how often it was started; above 1 it was interrupted, and `seconds` miss what was lost.
         scores: `report/crossplay.json`, see `popgen.reports.crossplay_report`; of an older version with what it says
             of pairs put right.
+        weak_members: a line for each member that does not play, see `popgen.reports.weak_members`.
+        unfinished: members that are kept for their lower skill.
     """
 
     path: Path
@@ -85,6 +88,8 @@ class RunRecord:
     lost_steps: int
     attempts: int
     scores: Mapping[str, Any]
+    weak_members: tuple[str, ...] = ()
+    unfinished: tuple[int, ...] = ()
 
 
 def read_run(path: str | Path, label: str | None = None) -> RunRecord:
@@ -121,7 +126,16 @@ def read_run(path: str | Path, label: str | None = None) -> RunRecord:
         lost_steps=_count_lost_steps(path / "ledger.lost.jsonl"),
         attempts=_count_attempts(path / "attempts.txt"),
         scores=scores,
+        weak_members=_describe_weak_members(config, population.members, scores),
+        unfinished=tuple(info.id for info in population.members if is_unfinished(info)),
     )
+
+
+def _describe_weak_members(
+    config: Mapping[str, Any], infos: Sequence[MemberInfo], scores: Mapping[str, Any]
+) -> tuple[str, ...]:
+    share = float(config.get("evaluation", {}).get("weak_share", 0.0))
+    return tuple(one.describe(scores["unit"]) for one in list_weak_members(infos, scores, share))
 
 
 def _find_run(path: Path) -> Path:

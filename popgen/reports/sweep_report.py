@@ -5,7 +5,8 @@ Keys of the JSON object (`sweep.json`); null stands for what is unknown:
     format, format_version   "popgen-sweep", 1
     varied                   the settings that the sweep varies, seeds aside
     runs                     one a run: id, path, method, environment, seed, settings (of `varied`), sp, xp, gap
-                             (SP - XP), real_steps, simulated_steps, seconds
+                             (SP - XP), real_steps, simulated_steps, seconds, weak_members (a line for each that does
+                             not play)
     groups                   one a setting: label, method, environment, unit, settings, seeds; sp, xp, gap (mean, low,
                              high); real_steps, simulated_steps, seconds (means)
     best                     environment -> label of the largest mean gap
@@ -83,6 +84,7 @@ def _describe_run(run: SweptRun) -> dict[str, Any]:
         "real_steps": sum(member.real for member in record.members),
         "simulated_steps": simulated,
         "seconds": None if None in times else round(sum(time or 0.0 for time in times), 1),
+        "weak_members": list(record.weak_members),
     }
 
 
@@ -152,10 +154,11 @@ def to_sheets(report: Mapping[str, Any]) -> list[Sheet]:
 
 
 def summary(report: Mapping[str, Any]) -> list[str]:
-    """The best setting of each environment, and what is missing."""
+    """The best setting of each environment, who does not play, and what is missing."""
     lines = [f"{name}: the largest SP - XP is that of {label}" for name, label in report["best"].items()]
     seeds = sorted({run["seed"] for run in report["runs"]})
     lines += [f"{len(report['runs'])} runs, {seeds_text(seeds)}"] if seeds else []
+    lines += [f"{run['id']}: {line}" for run in report["runs"] for line in run["weak_members"]]
     return lines + [f"missing: {run['id']} ({run['error']})" for run in report["missing"]]
 
 

@@ -12,13 +12,15 @@ from conftest import ROOT
 import popgen
 from popgen.cli.compose import compose
 from popgen.config.run_config import RunConfig, field_names
-from popgen.envs import env_names
+from popgen.envs import env_names, make_env
 from popgen.errors import UserError
 from popgen.methods import registry
 from popgen.methods.method import Method
 from popgen.methods.recipe import Recipe, because
 from popgen.methods.registry import METHODS, find_method
 
+KITCHENS = [name for name in env_names() if name.startswith("overcooked/")]
+SPECS = {name: make_env(name, 1).spec for name in env_names()}
 THOROUGH = ("xpm_wm", "xpm_sim", "lipo")
 
 BASE = Recipe("base", "", {"a.x": 1, "a.y": 2}, {"ring": {"a.x": because(3, "narrow")}})
@@ -67,6 +69,14 @@ def test_recipes_set_fields_of_their_method_on_layouts_that_there_are(method: st
         rows = recipe.by_layout
         assert set(rows) <= set(env_names())
         assert {name for settings in (recipe.settings, *rows.values()) for name in settings} <= fields
+
+
+@pytest.mark.parametrize("method", [name for name in METHODS if not METHODS[name].trains_ego])
+def test_every_recipe_of_a_generator_can_be_run_as_it_stands(method: str) -> None:
+    found = METHODS[method]
+    for scale, recipe in found.recipes.items():
+        for env in {*KITCHENS, *recipe.by_layout}:
+            found.check(popgen.recipe(method, env, scale), SPECS[env])
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -87,6 +87,14 @@ def test_an_optimiser_goes_on_where_it_was() -> None:
     )
 
 
+@pytest.mark.parametrize(("most", "left"), [(0.0, [3.0, 4.0]), (10.0, [3.0, 4.0]), (1.0, [0.6, 0.8])])
+def test_a_gradient_is_scaled_down_to_the_bound_and_0_is_none(most: float, left: list[float]) -> None:
+    parameter = nn.Parameter(torch.zeros(2))
+    parameter.grad = torch.tensor([3.0, 4.0])
+    assert float(w.clip_gradients([parameter], most)) == 5.0
+    torch.testing.assert_close(parameter.grad, torch.tensor(left), atol=1e-6, rtol=0)
+
+
 def test_a_fused_optimiser_steps_like_the_plain_one_and_goes_on_from_its_state() -> None:
     """Of 60 steps, 30 from the plain one's moments; the order of additions differs."""
     plain, fused = (torch.nn.Parameter(torch.linspace(-1.0, 1.0, 50)) for _ in range(2))

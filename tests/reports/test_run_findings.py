@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from support.finished import finished_run
 
+from popgen.reports.crossplay_report import leave_out
 from popgen.reports.run_findings import Finding, explain_run, explain_scores, find_control
 from popgen.reports.run_record import read_run
 from popgen.reports.training_series import IMAGINED, SHARE, WORLD_MODEL, read_panels
@@ -84,6 +85,45 @@ def test_what_cannot_be_said_is_not(values: dict[str, Any], text: str, good: boo
     assert [told[1] for told in found] == [good]
     told_pairs = any("1 of 2 pairs are worse" in text and text.endswith(": 2-1") for text in tell(**values))
     assert told_pairs == ("2, 1" in str(values))
+
+
+def test_unfinished_members_are_not_judged_and_those_that_do_not_play_are_named(tmp_path: Path) -> None:
+    """Of three players by chance the first is kept for its low skill."""
+    skills = [{"skill": "initial"}, {"skill": "final"}, {"skill": "final"}]
+    run = read_run(finished_run(tmp_path, "skilled", [{"SP": 10}] * 3, method="fcp", extras=skills, scores=(9.0, 9.0)))
+    own = {(one["seat_0"], one["seat_1"]): one["score"]["mean"] for one in run.scores["pairs"]}
+    assert run.unfinished == (1,) and own["2", "2"] == own["3", "3"] == 0.0
+    told = [finding.text for finding in explain_run(run) if not finding.good]
+    assert told[0].startswith("weak for this layout: SP 0.00 dishes")  # of members 2 and 3; the report's SP is 9
+    named = [f"member {m} does not play: self-play 0.00 dishes is no better than with a random partner" for m in (2, 3)]
+    assert [text.rpartition(",")[0] for text in told[1:3]] == named == [t.rpartition(",")[0] for t in run.weak_members]
+
+
+def test_a_report_without_some_members_is_that_of_the_others() -> None:
+    table = {(1, 1): 1.0, (1, 2): 2.0, (2, 1): 4.0, (2, 2): 8.0, (1, 3): 0.5, (3, 1): 0.5, (2, 3): 6.0, (3, 2): 3.0}
+    table |= {(3, 3): 10.0}
+    seats = [(str(i), str(j), score) for (i, j), score in table.items()]
+    seats += [s for m in "123" for s in ((m, "random", 0.1), ("random", m, 0.1), (m, "idle", 0.0), ("idle", m, 0.0))]
+    figures = ("score", "reward", "shaped_return")
+    pairs = [
+        {"seat_0": i, "seat_1": j, "events": [[], []]}
+        | {name: {"mean": score, "standard_error": 0.1} for name in figures}
+        for i, j, score in seats
+    ]
+    case = {"member": 2, "partner": 1}
+    report = scores_of(4.0, 2.0) | {
+        "environment": {
+            "name": "line/short", "params": {}, "fingerprint": "0" * 64, "cooking": None, "horizon": 20,
+            "score_name": "dishes",
+        },
+        "members": [1, 2, 3], "pairs": pairs, "event_names": [], "event_weights": [], "seed": 0, "training_seed": 0,
+        "steps": {"evaluation": 1}, "mixed_play": {"members": [{"member": 1}, {"member": 2}], "cases": [case]},
+    }  # fmt: skip
+    rest = leave_out(report, [1])
+    assert (rest["sp"]["mean"], rest["xp"]["mean"], rest["members"]) == (9.0, 4.5, [2, 3])
+    assert rest["mixed_play"] == {"members": [{"member": 2}], "cases": []}
+    assert not any("1" in (one["seat_0"], one["seat_1"]) for one in rest["pairs"])
+    assert leave_out(report, []) == report
 
 
 def test_a_control_is_a_run_with_all_else_equal(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ class EgoConfig(PpoSection):
     value_decay: Fraction = 0.95
     """By which the moving mean and spread of returns forget, per update."""
     grad_clip: Weight = 0.5
-    """Most norm of a gradient; 0: any."""
+    """Largest norm of a gradient, to which longer ones are scaled down; 0: as they are."""
 
     @model_validator(mode="after")
     def _batches_fit(self) -> EgoConfig:

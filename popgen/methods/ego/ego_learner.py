@@ -25,7 +25,7 @@ from popgen.methods.ego.ego_rollout import Choices, Company, EgoSampler, EndedEp
 from popgen.methods.ego.partner_seats import PartnerSeats
 from popgen.methods.ego.two_levels import advantages_of_decisions, cut_segments, information_of_skill, pay_segments
 from popgen.nets.feed_forward import Sizes, ValueNet
-from popgen.nets.weights import load_optimiser_state, load_weights, optimiser_state, weights_of
+from popgen.nets.weights import clip_gradients, load_optimiser_state, load_weights, optimiser_state, weights_of
 from popgen.play.policy import Policy
 from popgen.play.stacked_partners import PartnerPool
 from popgen.types import Weights
@@ -276,7 +276,7 @@ class EgoLearner:
             terms |= lost | {"loss": terms["loss"] + levels.high_weight * lost["loss"] - paid, "information": known}
         self.optimiser.zero_grad(set_to_none=True)
         terms["loss"].backward()
-        norm = nn.utils.clip_grad_norm_(self._learned, config.grad_clip or float("inf"))
+        norm = clip_gradients(self._learned, config.grad_clip)
         self.optimiser.step()
         return {name: float(value.detach()) for name, value in terms.items()} | {"grad_norm": float(norm)}
 

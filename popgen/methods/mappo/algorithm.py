@@ -92,7 +92,7 @@ class MappoConfig(PPOConfig):
         config.multi_agent(policies=set(names), policy_mapping_fn=_no_mapping)
         config.rl_module(rl_module_spec=module_spec(job, spec, inference_only=False))
         config.reporting(min_time_s_per_iteration=None, log_gradients=False)
-        config.debugging(seed=job.seed, log_level="ERROR")
+        config.debugging(seed=job.seed % 2**32, log_level="ERROR")  # numpy's global generator takes no more
         config._dont_auto_sync_env_runner_states = True
         return config
 

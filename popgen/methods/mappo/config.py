@@ -56,7 +56,7 @@ class PpoConfig(PpoSection):
     learning_rate_end: Fraction = 1.0
     """Share of `learning_rate` that is left at `max_steps`; it falls in a straight line."""
     grad_clip: Weight = 0.5
-    """Largest norm of a gradient; longer ones are scaled down."""
+    """Largest norm of a gradient, to which longer ones are scaled down; 0: as they are."""
     value_weight: Weight = 1.0
     """Weight of the critic's loss beside the policy's."""
     value_decay: Fraction = 0.9

@@ -34,7 +34,7 @@ LAPTOP = Recipe(
 
 DEMO = Recipe(
     "demo",
-    "A population of two that plays, in minutes on two cores: the laptop's recipe, stopped earlier.",
+    "A small population that plays, in minutes on two cores: the laptop's recipe, stopped earlier.",
     {
         "population.size": 2,
         "evaluation.episodes": 10,
@@ -169,6 +169,10 @@ _PAIRED = {"laptop": 8, "demo": 2, "paper": 8, "smoke": 2}
 """Members, two of a pair."""
 
 RECIPES = {recipe.name: recipe for recipe in (LAPTOP, DEMO, PAPER, SMOKE)}
+
+_ONE_SEED: Settings = {"population.size": because(3, "the members of one seed")}
+
+FCP_RECIPES = RECIPES | {"demo": Recipe("demo", DEMO.summary, _ONE_SEED, base=DEMO)}
 
 
 def _objectives(lambda_xp: float) -> dict[str, Settings]:

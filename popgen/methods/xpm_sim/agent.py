@@ -269,7 +269,7 @@ class XpmSimLearner:
     ) -> None:
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(list(parameters), self.config.grad_clip)
+        w.clip_gradients(parameters, self.config.grad_clip)
         optimiser.step()
 
     # ---- what is kept --------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ class XpmSimConfig(PaidCrossPlayOptions):
     entropy: Weight = 0.01
     """Weight of the policy's entropy (the paper's entropy coef.)."""
     grad_clip: Weight = 0.5
-    """Largest norm of a gradient; longer ones are scaled down."""
+    """Largest norm of a gradient, to which longer ones are scaled down; 0: as they are."""
     lambda_xp: Weight = 0.75
     """Weight of cross-play with the strongest partner, subtracted from self-play (lambda_XP, eq. XPM-Sim)."""
     lambda_ramp: NonNegative = 10

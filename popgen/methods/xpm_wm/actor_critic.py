@@ -264,7 +264,7 @@ class AgentNetworks:
     def _step_down(self, optimiser: torch.optim.Optimizer, loss: Tensor, parameters: Iterable[nn.Parameter]) -> None:
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)
+        w.clip_gradients(parameters, self.config.grad_clip)
         optimiser.step()
 
     @torch.no_grad()

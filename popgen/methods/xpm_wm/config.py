@@ -76,7 +76,7 @@ class WorldModelConfig(Schema):
     learning_rate: Rate = 2e-3
     """Adam's step size in phase 1."""
     grad_clip: Weight = 100.0
-    """Largest norm of the model's gradient; longer ones are scaled down."""
+    """Largest norm of a gradient, to which longer ones are scaled down; 0: as they are."""
     batch: Batch = 64
     """Windows in one update."""
     length: Annotated[_Int, Field(ge=2, le=1024)] = 8
@@ -166,7 +166,7 @@ class AgentConfig(CrossPlayOptions):
     entropy_ramp: NonNegative = 50
     """Updates over which the entropy's weight goes to `entropy_end`; 0: the same throughout."""
     grad_clip: Weight = 0.5
-    """Largest norm of a gradient; longer ones are scaled down."""
+    """Largest norm of a gradient, to which longer ones are scaled down; 0: as they are."""
     unimix: UniformShare = 0.01
     """Share of the uniform distribution that is mixed into the policy."""
     bins: Annotated[_Int, Field(ge=3, le=10_001)] = 65

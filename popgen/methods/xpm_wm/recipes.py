@@ -91,7 +91,7 @@ LAPTOP = Recipe(
 
 DEMO = Recipe(
     "demo",
-    "A population of two that plays, in minutes on two cores: the laptop's recipe, stopped earlier.",
+    "A small population that plays, in minutes on two cores: the laptop's recipe, stopped earlier.",
     {
         "population.size": 2,
         "evaluation.episodes": 10,
@@ -291,6 +291,6 @@ def _without_partners(own: Settings) -> dict[str, Recipe]:
     }
 
 
-FCP_RECIPES = _without_partners({})
+FCP_RECIPES = _without_partners({"population.size": because(4, "member 1, and the three of one seed")})
 
 MEP_RECIPES = _without_partners({"agent.surprise": because(0.01, "the paper's alpha")})

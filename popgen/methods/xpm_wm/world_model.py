@@ -463,7 +463,7 @@ class ModelLearner:
         loss = sum((weights[name] * term for name, term in terms.items()), torch.zeros((), device=self.device))
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
+        norm = w.clip_gradients(self.model.parameters(), self.config.grad_clip)
         if not torch.isfinite(loss.detach() + norm):
             bad = [name for name, term in terms.items() if not torch.isfinite(term)] or ["gradient"]
             problem = f"{' and '.join(bad)} not finite in update {self.updates + 1} of the world model"

@@ -253,6 +253,7 @@ def _write_notes(comparison: Comparison) -> list[str]:
     for run in runs:
         if run.settings.get("diversity.order") == "concurrent":
             notes.append(f"{run.run_id} trained its agents together: for fewer agents it is these agents' share.")
+        notes += [f"{run.run_id}: {line}." for line in run.weak_members]
         if adopted := sum(m.adopted for m in run.members):
             notes.append(f"{run.run_id} took over {adopted} agents of another run, with the steps of that run.")
         if run.attempts > 1:

@@ -121,7 +121,7 @@ _UNPLAYED = ("costs",)
 
 
 def _list_origins(record: Record) -> list[str]:
-    """Sentences: evaluation, machines, runs made before."""
+    """Sentences: evaluation, machines, runs made before, members that do not play."""
     runs = record["runs"]
     told = [f"Budget {record['budget']}, written {record['written']}.", *_list_episodes(record)]
     machines = Counter(run["machine"] or "a machine that is not known" for run in runs)
@@ -131,6 +131,11 @@ def _list_origins(record: Record) -> list[str]:
             f"{before} of {len(runs)} runs were not made by this command but taken over: method, environment, seed, "
             "size and all settings that decide the result are the same."
         )
+    told += [
+        f"{run['row']} in {run['environment']}, seed {run['seed']}: {line}."
+        for run in runs
+        for line in run.get("weak_members", [])
+    ]
     if any(run["changed"] for run in runs):
         told.append("A commit with + had changes that were not committed.")
     return told

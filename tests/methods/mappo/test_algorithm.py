@@ -62,6 +62,14 @@ def comedi(solo: Mappo) -> Iterator[Mappo]:
     algorithm.stop()
 
 
+def test_rllib_takes_the_largest_seed_of_a_run_and_small_ones_as_they_are(solo: Mappo) -> None:
+    assert solo.config.seed == 1
+    large = build(Job(ENV, PPO, None, (1,), seed=(2**31 - 1) * 1000 + 1000))
+    large.train()
+    assert totals(large) == {(1, "SP"): 40}
+    large.stop()
+
+
 def totals(algorithm: Mappo) -> dict[tuple[int, str], int]:
     found: Counter[tuple[int, str]] = Counter()
     for counted in algorithm.report.counted:

@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from popgen.evaluation.crossplay import RANDOM, CrossPlayResult, Estimate
+from popgen.evaluation.crossplay import RANDOM
+from popgen.evaluation.estimates import Estimate
 from popgen.evaluation.holdout_lineages import TRAINED_WITH
 from popgen.population.manifest import MemberInfo
+from popgen.reports.crossplay_report import list_mates, read_estimate
 from popgen.types import FINAL_SKILL
 
 NEVER_REACHED = 1000.0
@@ -51,21 +54,38 @@ class WeakMember:
         )
 
 
-def list_weak_members(infos: Sequence[MemberInfo], result: CrossPlayResult, share: float) -> list[WeakMember]:
-    """Members that do not play, by their methods' targets where there are any, by each other and by a random partner.
+def list_weak_members(infos: Sequence[MemberInfo], scores: Mapping[str, Any], share: float) -> list[WeakMember]:
+    """Members of a population that do not play, of those that are meant to play with themselves or their mates.
 
-    A member that is kept for its lower skill (`extra.skill`) is meant to be weak; not meant for itself is an ego that
-    learned beside partners (`extra.trained_with`), or one of a pair (`extra.role`) that is kept without its mate.
+    Args:
+        infos: of all members; `extra.target` is the self-play that a method aimed at.
+        scores: the evaluation, see `popgen.reports.crossplay_report`.
+        share: as in `find_weak_members`.
     """
     targets = {info.id: float(info.extra["target"]) for info in infos if "target" in info.extra}
-    unskilled = {info.id for info in infos if info.extra.get("skill", FINAL_SKILL) != FINAL_SKILL}
-    single = {info.id for info in infos if "role" in info.extra and result.mate_of(info.id) == info.id}
+    meant = list_meant(infos, scores)
+    return [one for one in find_weak_members(scores, targets, share) if one.member in meant]
+
+
+def list_meant(infos: Sequence[MemberInfo], scores: Mapping[str, Any]) -> list[int]:
+    """Members that are meant to play well with themselves, or with their mates.
+
+    A member that is kept for its lower skill (`extra.skill`) is not, nor is an ego that learned beside partners
+    (`extra.trained_with`), or one of a pair (`extra.role`) that is kept without its mate.
+    """
+    mates = list_mates(scores)
+    unfinished = {info.id for info in infos if is_unfinished(info)}
+    single = {info.id for info in infos if "role" in info.extra and mates.get(info.id) == info.id}
     taught = {info.id for info in infos if info.extra.get(TRAINED_WITH)}
-    found = find_weak_members(result, targets, share)
-    return [one for one in found if one.member not in unskilled | single | taught]
+    return [info.id for info in infos if info.id not in unfinished | single | taught]
 
 
-def find_weak_members(result: CrossPlayResult, targets: Mapping[int, float], share: float) -> list[WeakMember]:
+def is_unfinished(info: MemberInfo) -> bool:
+    """A member that is kept for its lower skill."""
+    return info.extra.get("skill", FINAL_SKILL) != FINAL_SKILL
+
+
+def find_weak_members(scores: Mapping[str, Any], targets: Mapping[int, float], share: float) -> list[WeakMember]:
     """Members whose self-play is, by more than two standard errors, below `share` of their target or of the median of
     the others; and of the rest those whose self-play is no better than their own play beside a random partner.
 
@@ -73,15 +93,16 @@ def find_weak_members(result: CrossPlayResult, targets: Mapping[int, float], sha
     play beside a random partner does, whatever its sign.
 
     Args:
-        result: the evaluation.
+        scores: the evaluation.
         targets: by member, where its method has one.
         share: 0 finds nobody.
     """
+    played = {(one["seat_0"], one["seat_1"]): read_estimate(one["score"]) for one in scores["pairs"]}
+    own = {member: _average_both(played, member, mate) for member, mate in list_mates(scores).items()}
     found = []
-    for member in result.members if share > 0.0 else ():
-        sp = result.own_play(member)
-        what, aim = _find_aim(result, member, targets.get(member, 0.0))
-        beside = result.member_beside(RANDOM, member)
+    for member, sp in own.items() if share > 0.0 else ():
+        what, aim = _find_aim(own, member, targets.get(member, 0.0))
+        beside = _average_both(played, member, RANDOM)
         if aim > 0.0 and sp.mean + _double_error(sp) < share * aim:
             found.append(WeakMember(member, sp, aim, what, share))
         elif sp.mean <= beside.mean:
@@ -89,9 +110,15 @@ def find_weak_members(result: CrossPlayResult, targets: Mapping[int, float], sha
     return found
 
 
-def _find_aim(result: CrossPlayResult, member: int, target: float) -> tuple[str, float]:
+def _average_both(played: Mapping[tuple[str, str], Estimate], member: int, partner: int | str) -> Estimate:
+    """Mean over both seatings of those that were played."""
+    seats = dict.fromkeys([(str(member), str(partner)), (str(partner), str(member))])
+    return Estimate.average([played[one] for one in seats if one in played])
+
+
+def _find_aim(own: Mapping[int, Estimate], member: int, target: float) -> tuple[str, float]:
     """The higher of a member's target and the other members' median self-play, and which it is; 0 where neither is."""
-    others = [result.own_play(other).mean for other in result.members if other != member]
+    others = [sp.mean for other, sp in own.items() if other != member]
     aims = {"target": target if target < NEVER_REACHED else 0.0}
     aims["other members"] = float(np.median(others)) if len(others) >= OTHERS else 0.0
     what = max(aims, key=lambda name: aims[name])
