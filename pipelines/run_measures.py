@@ -246,18 +246,9 @@ def measure_acting(job: RunToMeasure) -> dict[str, Any]:
 
 def measure_ego(job: RunToMeasure) -> dict[str, Any]:
     """Score of an ego beside each held-out population, their mean, and its worst pair."""
-    wanted = {"ego": [("ego", str(job.folder))], "partner": [(t, str(path)) for t, path in job.holdouts.items()]}
-    opened = open_sides(wanted, title_of)
-    check_disjoint(opened.sides["ego"], opened.sides["partner"])
-    environment = opened.environment
-
-    def make(num_envs: int, seed: int) -> Any:
-        return make_env(environment.name, num_envs, seed=seed, **environment.params)
-
-    casting = Casting(opened.sides["ego"], opened.sides["partner"])
-    report = to_dict(evaluate_holdout(casting, environment, make, job.episodes, SEED))
-    means = {one["partners"]: one["mean"] for one in report["standings"] if one["partners"] in job.holdouts}
-    worst = min(one["worst"]["score"] for one in report["standings"])
+    standings = _play_with_strangers(job, job.holdouts)
+    means = {one["partners"]: one["mean"] for one in standings if one["partners"] in job.holdouts}
+    worst = min(one["worst"]["score"] for one in standings)
     return {**means, "average": float(np.mean(list(means.values()))), "worst": worst}
 
 
@@ -266,16 +257,26 @@ def measure_human(job: RunToMeasure) -> dict[str, Any]:
     layout = read_run(job.folder).environment.name.partition("/")[2]
     if layout not in LAYOUTS:
         return {}
-    wanted = {"ego": [("ego", str(job.folder))], "partner": [("people", str(find_proxy(job, layout)))]}
+    standings = _play_with_strangers(job, {"people": find_proxy(job, layout)})
+    return {"score": next(one["mean"] for one in standings if one["partners"] == "people")}
+
+
+def _play_with_strangers(job: RunToMeasure, partners: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """Standings of an ego beside populations, by title, with which it has nothing in common.
+
+    Raises:
+        UserError: it has.
+    """
+    wanted = {"ego": [("ego", str(job.folder))], "partner": [(title, str(path)) for title, path in partners.items()]}
     opened = open_sides(wanted, title_of)
+    check_disjoint(opened.sides["ego"], opened.sides["partner"])
     environment = opened.environment
 
     def make(num_envs: int, seed: int) -> Any:
         return make_env(environment.name, num_envs, seed=seed, **environment.params)
 
     casting = Casting(opened.sides["ego"], opened.sides["partner"])
-    report = to_dict(evaluate_holdout(casting, environment, make, job.episodes, SEED))
-    return {"score": next(one["mean"] for one in report["standings"] if one["partners"] == "people")}
+    return to_dict(evaluate_holdout(casting, environment, make, job.episodes, SEED))["standings"]
 
 
 def find_proxy(job: RunToMeasure, layout: str) -> Path:

@@ -22,7 +22,7 @@ MATRIX_EPISODES, HOLDOUT_EPISODES = 20, 40
 """Defaults: for each ordered pair of members; for each ego, partner and seat."""
 
 _MATRIX_ONLY = ("members", "env", "param")
-_HOLDOUT_ONLY = ("human", "control", "best_responses", "response_set", "responses")
+_HOLDOUT_ONLY = ("human", "met", "control", "best_responses", "response_set", "responses")
 _NAMED = "[NAME=]POPULATION"
 
 
@@ -56,6 +56,14 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--human", metavar=_NAMED, nargs="+", action="extend", type=named_path, help="human proxies as partners"
     )
+    parser.add_argument(
+        *("--met",),
+        metavar=_NAMED,
+        nargs="+",
+        action="extend",
+        type=named_path,
+        help="populations that taught the egos: rows of their own, in no average",
+    )
     parser.add_argument("--control", metavar="NAME", help="an ego over which the others' margins are told")
     parser.add_argument(
         "--best-responses", action="store_true", help="train the best responses that are missing to all partners first"
@@ -75,7 +83,7 @@ def add(commands: Any) -> None:
 def evaluate(args: argparse.Namespace) -> int:
     """Play, and write the report."""
     bound_threads(1)
-    together = args.partners or args.human
+    together = args.partners or args.human or args.met
     for name in _MATRIX_ONLY if together else _HOLDOUT_ONLY:
         if getattr(args, name):
             without = "without" if together else "with"
@@ -182,16 +190,17 @@ def _train_responses(
 def _cast_players(args: argparse.Namespace) -> tuple[Casting, EnvironmentInfo]:
     """Egos and partners with nothing in common, in one environment."""
     from popgen.evaluation.holdout import Casting
-    from popgen.evaluation.holdout_overlap import check_disjoint
+    from popgen.evaluation.holdout_overlap import check_disjoint, check_met
     from popgen.evaluation.holdout_players import open_sides
     from popgen.reports.method_titles import title_of
 
-    wanted = {"ego": args.populations, "partner": args.partners or [], "human": args.human or []}
+    wanted = {"ego": args.populations, "partner": args.partners or [], "human": args.human or [], "met": args.met or []}
     opened = open_sides(wanted, title_of)
     humans = opened.sides["human"]
-    partners = (*opened.sides["partner"], *humans)
+    partners, met = (*opened.sides["partner"], *humans), opened.sides["met"]
     check_disjoint(opened.sides["ego"], partners)
+    check_met(opened.sides["ego"], met)
     if args.control and args.control not in {group.label for group in opened.sides["ego"]}:
         raise UserError("--control", f"there is no ego {args.control}", "name it as NAME=POPULATION")
-    named = frozenset(group.label for group in humans)
-    return Casting(opened.sides["ego"], partners, humans=named), opened.environment
+    named, taught = (frozenset(group.label for group in groups) for groups in (humans, met))
+    return Casting(opened.sides["ego"], (*partners, *met), humans=named, met=taught), opened.environment

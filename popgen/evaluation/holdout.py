@@ -34,15 +34,17 @@ class Casting:
     """Who is to play.
 
     Attributes:
-        egos, partners: groups; `partners` are held out.
+        egos, partners: groups; `partners` are held out, but for those of `met`.
         responses: partner's identity -> the best response trained for it.
-        humans: labels of those partners that stand for people; they count in no average over hold-outs.
+        humans, met: labels of those partners that stand for people, and of those that taught an ego; they count in no
+            average over hold-outs.
     """
 
     egos: tuple[Group, ...]
     partners: tuple[Group, ...]
     responses: Mapping[str, Response] = field(default_factory=dict)
     humans: frozenset[str] = frozenset()
+    met: frozenset[str] = frozenset()
 
     @property
     def ego_players(self) -> list[Player]:

@@ -27,6 +27,7 @@ from popgen.evaluation.holdout_metrics import (
     measure_regret,
     normalise_returns,
 )
+from popgen.evaluation.holdout_overlap import has_met
 from popgen.evaluation.holdout_players import Group
 
 CVAR_SHARE = 0.25
@@ -68,6 +69,7 @@ class Standing:
         br_prox: inter-quartile mean of BR-Prox (clipped at 1) over seeds, and the partners and seats that have a
             reference, with its interval; NaN without any.
         br_prox_unclipped: mean of the same without the bound.
+        br_prox_least: the least of one partner: mean of the same over seeds and seats.
         normalised: mean of score over the best score that anybody reached with the partner; NaN without one above 0.
         regret: mean of what the reference scores more than the ego.
     """
@@ -83,6 +85,7 @@ class Standing:
     cvar: float
     br_prox: Interval
     br_prox_unclipped: float
+    br_prox_least: float
     normalised: float
     regret: float
 
@@ -113,7 +116,7 @@ class PartnerSet:
 
 
 ALL, OWN, CROSS = "all hold-outs", "own method", "other methods"
-"""Labels of sets of groups: all but people; those of the methods that taught the ego; those of other methods."""
+"""Labels of sets of groups: all but people and teachers; those of the methods that taught the ego; those of others."""
 
 
 BEST_RESPONSE, MATE, SELF_PLAY = "best response", "mate", "self-play"
@@ -135,10 +138,12 @@ def find_references(result: HoldoutResult) -> np.ndarray:
 
 
 def list_sets(result: HoldoutResult, ego: Group) -> list[PartnerSet]:
-    """Each group of partners, then all hold-outs, those of the ego's own methods and those of other methods."""
+    """Each group of partners, then all hold-outs, those of the ego's own methods and those of other methods; of those
+    that taught some ego only its own teachers."""
     casting = result.casting
-    held_out = [group for group in casting.partners if group.label not in casting.humans]
-    chosen = [(group.label, [group.label]) for group in casting.partners]
+    held_out = [group for group in casting.partners if group.label not in casting.humans | casting.met]
+    shown = [group for group in casting.partners if group.label not in casting.met or has_met(ego, group)]
+    chosen = [(group.label, [group.label]) for group in shown]
     if len(held_out) > 1:
         own = [group.label for group in held_out if group.method in ego.taught_by]
         chosen.append((ALL, [group.label for group in held_out]))
@@ -169,6 +174,7 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
         cvar=measure_cvar(means, CVAR_SHARE),
         br_prox=_bound_proximity(measure_br_proximity(means, references)),
         br_prox_unclipped=float(np.nanmean(unclipped)) if np.isfinite(unclipped).any() else math.nan,
+        br_prox_least=_find_least_share(unclipped),
         normalised=float(normalised.mean()),
         regret=float(measure_regret(means, references).mean()),
     )
@@ -185,6 +191,12 @@ def _bound_proximity(clipped: np.ndarray) -> Interval:
     if not kept.size:
         return Interval(math.nan, math.nan, math.nan)
     return _bound_figure(kept, lambda drawn: interquartile_mean(drawn[np.isfinite(drawn)]))
+
+
+def _find_least_share(ratios: np.ndarray) -> float:
+    """Of (runs, K, 2) the least mean of a partner; NaN where nobody has a ratio."""
+    known = [np.nanmean(ratios[:, place]) for place in range(ratios.shape[1]) if np.isfinite(ratios[:, place]).any()]
+    return float(min(known, default=math.nan))
 
 
 def _find_worst_pair(result: HoldoutResult, rows: Sequence[int], columns: Sequence[int]) -> Worst:

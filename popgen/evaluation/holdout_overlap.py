@@ -28,6 +28,24 @@ def check_disjoint(egos: Sequence[Group], partners: Sequence[Group]) -> None:
             _check_lineages(ego, partner)
 
 
+def has_met(ego: Group, partner: Group) -> bool:
+    """All of a partner's players are training partners of an ego, by their digests."""
+    met = frozenset[str]().union(*(one.digests for one in ego.partners))
+    return all(player.digest in met for player in partner.players)
+
+
+def check_met(egos: Sequence[Group], partners: Sequence[Group]) -> None:
+    """Make sure that all who are named as training partners taught an ego.
+
+    Raises:
+        UserError: one did not.
+    """
+    for partner in partners:
+        if not any(has_met(ego, partner) for ego in egos):
+            problem = f"{partner.label} has members that trained none of the egos"
+            raise UserError("--met", problem, "hold them out by --with, or name those that did: PATH:1,3")
+
+
 def _check_members(ego: Group, partner: Group) -> None:
     own = _gather_digests(ego.lineages)
     met = frozenset[str]().union(*(one.digests for one in ego.partners))

@@ -6,13 +6,15 @@ Keys of the JSON object (`holdout.json`); null stands for what is unknown:
     environment              as in a population's manifest
     unit, episodes, seed     of scores; for each pair and seat; of the evaluation
     steps                    {"evaluation": N}
-    egos, partners           groups: label, method, taught_by (methods), human, players (source, member, sha256,
+    egos, partners           groups: label, method, taught_by (methods), human, met (it taught an ego), players (source,
+                             member, sha256,
                              identity, mate: number of the member that it was trained in a pair with or null, response:
                              the best response to it that was played: source, scale, settings, steps; or null)
     standings                one for each ego and set of partners: ego, partners, count, referenced (of these partners,
                              with a reference), mean, sd, se, interval, seat_0, seat_1 (where the ego sat), worst
-                             (score, ego, partner, seat), cvar_25, br_prox_iqm and br_prox_unclipped (null without a
-                             partner that has a reference), normalised_return, regret
+                             (score, ego, partner, seat), cvar_25, br_prox_iqm, br_prox_unclipped (mean) and
+                             br_prox_least (of one partner), null without a partner that has a reference,
+                             normalised_return, regret
     controls                 egos: ego, alone, mate, random, idle; partners: partner and the same (mean, sd, se); mate
                              is null where none was trained in a pair
     margins                  ego, control, partners, gain (value, low, high), resampled (for the interval)
@@ -94,9 +96,9 @@ def _describe_group(result: HoldoutResult, group: Group) -> dict[str, Any]:
         }
         for place, (one, mate) in enumerate(zip(group.players, find_mates(group.players), strict=True))
     ]
-    human = group.label in result.casting.humans
+    apart = {"human": group.label in result.casting.humans, "met": group.label in result.casting.met}
     taught = sorted(group.taught_by)
-    return {"label": group.label, "method": group.method, "taught_by": taught, "human": human, "players": players}
+    return {"label": group.label, "method": group.method, "taught_by": taught, **apart, "players": players}
 
 
 def _describe_response(one: Response | None) -> dict[str, Any] | None:
@@ -115,6 +117,7 @@ def _describe_standing(one: Standing) -> dict[str, Any]:
         "cvar_25": one.cvar,
         "br_prox_iqm": asdict(one.br_prox),
         "br_prox_unclipped": one.br_prox_unclipped,
+        "br_prox_least": one.br_prox_least,
         "normalised_return": one.normalised,
         "regret": one.regret,
     }

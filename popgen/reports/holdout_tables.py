@@ -32,21 +32,31 @@ def to_markdown(report: Mapping[str, Any]) -> str:
 
 
 def list_lines(report: Mapping[str, Any]) -> list[str]:
-    """The worst pair of each ego, and the notes."""
+    """The worst pair of each ego, how it does beside its teachers, and the notes."""
     egos = [one["label"] for one in report["egos"]]
     lines = []
     for ego in egos:
-        rows = [one for one in report["standings"] if one["ego"] == ego and not _is_human(report, one["partners"])]
+        rows = [one for one in report["standings"] if one["ego"] == ego and not _is_apart(report, one["partners"])]
         if rows:
             worst = min((one["worst"] for one in rows), key=lambda one: one["score"])
             place = f"{worst['ego']} in seat {worst['seat']} beside {worst['partner']}"
             lines.append(f"worst of {ego}: {worst['score']:.2f} {report['unit']}, {place}")
     count = f"{report['episodes']} episodes for each pair and seat"
+    lines += [_compare_with_best(one) for one in report["standings"] if _is_apart(report, one["partners"], "met")]
     return [*lines, *report["notes"], f"{count}, {report['steps']['evaluation']:,} environment steps"]
 
 
-def _is_human(report: Mapping[str, Any], label: str) -> bool:
-    return any(one["label"] == label and one["human"] for one in report["partners"])
+def _is_apart(report: Mapping[str, Any], label: str, *kinds: str) -> bool:
+    """A group that counts in no average: people, or teachers of an ego."""
+    groups = [one for one in report["partners"] if one["label"] == label]
+    return any(one.get(kind) for one in groups for kind in kinds or ("human", "met"))
+
+
+def _compare_with_best(standing: Mapping[str, Any]) -> str:
+    """An ego beside those that taught it, as shares of what the best known does with each."""
+    mean, least = (number_text(standing[f"br_prox_{name}"]) for name in ("unclipped", "least"))
+    place = f"{standing['ego']} beside its training partners {title_of(standing['partners'])}"
+    return f"{place}: {mean} of the best known with each on average, {least} with the least"
 
 
 def _make_score_sheet(report: Mapping[str, Any]) -> Sheet:

@@ -91,6 +91,25 @@ def test_own_and_other_methods_stand_apart_and_people_count_in_no_average(result
     assert sets[OWN] == (1, 2) and sets[CROSS] == (0,)
 
 
+def test_teachers_stand_apart_beside_whom_they_taught(result: HoldoutResult) -> None:
+    """L taught the first ego alone: its row is none of the other's, and it counts in no average."""
+    ego, base = result.casting.egos
+    taught = replace(ego, partners=(Lineage("lipo", 5, "d", frozenset({"L1"})),))
+    casting = replace(result.casting, egos=(taught, base), met=frozenset({"L"}))
+    own = replace(result, casting=casting)
+    assert {one.label: one.columns for one in list_sets(own, taught)} == {"L": (0,), "W": (1, 2), "people": (3,)}
+    assert {one.label: one.columns for one in list_sets(own, base)} == {"W": (1, 2), "people": (3,)}
+    report = to_dict(own)
+    (row,) = [one for one in report["standings"] if one["partners"] == "L"]
+    # The means beside L of the seeds ONE and STAY, of the reference's 132: (126 + 72 + 120 + 12) / 4 = 82.5.
+    assert row["br_prox_unclipped"] == row["br_prox_least"] == pytest.approx(82.5 / 132)
+    told = "ego beside its training partners L: 0.62 of the best known with each on average, 0.62 with the least"
+    assert told in list_lines(report) and not any(line.startswith("worst of ego: 12.00") for line in list_lines(report))
+    both = describe_standing(result, ego, PartnerSet("both", (0, 1)))
+    assert both.br_prox_least == pytest.approx(0.625)  # beside W's first (66 + 66 + 60 + 6) / 4 of 66 are 0.75
+    assert both.br_prox_unclipped == pytest.approx((0.625 + 0.75) / 2)
+
+
 def test_figures_by_hand(result: HoldoutResult) -> None:
     one = describe_standing(result, result.casting.egos[0], PartnerSet("L", (0,)))
     means = np.array([126.0, 72.0, 120.0, 12.0])

@@ -21,7 +21,7 @@ from popgen.evaluation.holdout_lineages import (
     read_partners,
     read_people,
 )
-from popgen.evaluation.holdout_overlap import check_disjoint
+from popgen.evaluation.holdout_overlap import check_disjoint, check_met
 from popgen.evaluation.holdout_players import EGO, Group, Player, open_sides
 from popgen.methods.mappo.config import MappoRun
 from popgen.methods.mappo.method import MAPPO
@@ -77,6 +77,13 @@ def test_shared_members_training_partners_and_seeds_are_refused() -> None:
     refused(ego, trained("held", "lipo", 2, {"e"}), "member 1 is the ego ego itself")
     refused(ego, trained("held", "lipo", 1, {"z"}), "held: has seed 1 of lipo, which the ego ego is trained with; hold")
     refused(trained("own", "lipo", 3, {"m"}), trained("held", "lipo", 3, {"z"}), "which the ego own is itself of")
+
+
+def test_only_who_taught_an_ego_is_a_training_partner() -> None:
+    ego = trained("ego", "ego_fcp", 7, {"e"}, met("lipo", 1, "ab"))
+    check_met([trained("none", "ego_fcp", 8, {"n"}), ego], [trained("taught", "lipo", 1, {"a", "b"})])
+    with pytest.raises(UserError, match="--met.*some has members that trained none of the egos"):
+        check_met([ego], [trained("some", "lipo", 1, {"a", "c"})])
 
 
 def test_what_a_partner_was_trained_with_counts_as_well() -> None:

@@ -429,13 +429,13 @@ def test_an_earlier_record_tells_only_figures_of_todays_meaning(
 def test_an_ego_is_measured_beside_the_clone_of_people_that_is_fitted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The ego is a random player here, and so is the clone."""
-    folder = finished_run(tmp_path, "one", [{"SP": 10}])
+    """The ego is a random player here, and so is the clone; one of the ego's own seed is no stranger."""
+    folder, other = (finished_run(tmp_path, name, [{"SP": 10}], seed=seed) for seed, name in enumerate(("one", "two")))
     asked: list[tuple[str, str, int]] = []
 
     def fit(path: Path, layout: str, half: str, *, search: Any, **_: Any) -> None:
         asked.append((layout, half, search.drawn))
-        shutil.copytree(folder / "population", path)
+        shutil.copytree(other / "population", path)
 
     monkeypatch.setattr(proxies, "fit_population", fit)
     job = RunToMeasure(folder, "XPM-WM", 2, {}, humans=tmp_path / "humans", proxy={"drawn": 3})
@@ -443,3 +443,6 @@ def test_an_ego_is_measured_beside_the_clone_of_people_that_is_fitted_once(
     assert asked == [("cramped_room", "B", 3)]
     (kept,) = (tmp_path / "humans").iterdir()
     assert kept.name.startswith("cramped_room_B-s0-")
+    shutil.copytree(folder / "population", kept, dirs_exist_ok=True)
+    with pytest.raises(UserError, match="has seed 0 of xpm_wm, which the ego ego is itself of"):
+        run_measures.measure_human(job)
