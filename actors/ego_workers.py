@@ -52,7 +52,7 @@ def read_partner(text: str) -> NamedMembers:
         path, numbers = text, ""
     population = load_population(path)
     everyone = range(1, len(population) + 1)
-    members = tuple(int(number) for number in numbers.split(",") if number) or _list_distinct(population)
+    members = tuple(int(number) for number in numbers.split(",") if number) or list_distinct(population)
     if wrong := [member for member in members if member not in everyone]:
         raise UserError("ego.partners", f"{path} has no member {wrong[0]}", f"it has {len(population)}")
     if not members:
@@ -63,12 +63,15 @@ def read_partner(text: str) -> NamedMembers:
     return NamedMembers(population, members, hashlib.sha256(data).hexdigest())
 
 
-def _list_distinct(population: Population) -> tuple[int, ...]:
-    """Members whose weights no earlier one has."""
-    weights = [population.info(member).policy_sha256 for member in range(1, len(population) + 1)]
-    return tuple(
-        member for member, own in enumerate(weights, 1) if own == NO_WEIGHTS or own not in weights[: member - 1]
-    )
+def list_distinct(population: Population) -> tuple[int, ...]:
+    """Members that act as no earlier one does; those without weights cannot be told apart, and all stay."""
+    infos, fingerprint = population.members, population.env_info.fingerprint
+    known = [identify_member(info, fingerprint) for info in infos]
+    kept = [
+        info.policy_sha256 == NO_WEIGHTS or own not in known[:n]
+        for n, (info, own) in enumerate(zip(infos, known, strict=True))
+    ]
+    return tuple(member for member, stays in enumerate(kept, 1) if stays)
 
 
 def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:
@@ -81,9 +84,14 @@ def load_partners(config: EgoRun, spec: EnvSpec) -> list[NamedMembers]:
     for one in named:
         check_compatible(one.population, spec)
     _check_pinned(config, named)
-    digests = [digest for one in describe_partners(named) for digest in one.policy_sha256 if digest != NO_WEIGHTS]
-    if len(set(digests)) < len(digests):
-        problem = "hold a member twice (by the digest of its weights), which would play twice as often as others"
+    known = [
+        identity
+        for one in describe_partners(named)
+        for digest, identity in zip(one.policy_sha256, one.identity, strict=True)
+        if digest != NO_WEIGHTS
+    ]
+    if len(set(known)) < len(known):
+        problem = "hold a member twice (by all that decides how it acts), which would play twice as often as others"
         raise UserError("ego.partners", problem, "name each once: PATH:1,3")
     if isinstance(config, BrRun) and (count := sum(len(one.members) for one in named)) > 1:
         raise UserError("ego.partners", f"{count} members, but a best response has one partner", "name it: PATH:3")

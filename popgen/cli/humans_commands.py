@@ -34,7 +34,7 @@ def add(commands: Any) -> None:
         show_humans,
         "what people did, and their clones beside them",
         "Keys of --json: layouts, each with layout, games, joint_steps, people (mean, deviation), clones (by half: "
-        "mean, within, dishes, likelihood) and published_dishes.",
+        "mean, within, dishes, likelihood) and published_dishes (by half).",
     )
     for parser in (fit, show):
         parser.add_argument("--layout", action="append", metavar="NAME", help="may be repeated; all five by default")
@@ -70,7 +70,8 @@ def fit_humans(args: argparse.Namespace) -> int:
             written.append({"layout": layout, "half": half, "path": str(path), **figures})
             if not args.json:
                 print(
-                    f"{path}: {figures['dishes']:.2f} dishes, {figures['within']} of {figures['cells']} within 1 SD",
+                    f"{path}: {figures['dishes']:.2f} dishes, {figures['within']} of {figures['cells']} "
+                    f"within 1 SD of half {half}'s people",
                     flush=True,
                 )
     seconds = time.perf_counter() - began

@@ -16,7 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from popgen.envs.contract import BatchedEnv
-from popgen.envs.player_events import count_diversity_events, count_player_events
+from popgen.envs.player_events import (
+    count_diversity_events,
+    count_player_events,
+    name_diversity_events,
+    name_player_events,
+)
 from popgen.errors import UserError
 from popgen.evaluation.holdout_metrics import Interval
 from popgen.evaluation.holdout_players import Player, find_mates, list_distinct
@@ -33,6 +38,7 @@ class PartnerDiversity:
         players: K partners.
         counts: (K, F) mean counts of an episode, over both seats.
         kinds: (K, 2 F') mean counts of what BR-Div is of, those in seat 0 and then those in seat 1.
+        count_names, kind_names: of the F events, and of the 2 F' kinds, with the seat.
         diversity: of all.
         chosen: indices of the most diverse ones that were asked for, ascending.
         chosen_diversity: of these.
@@ -44,6 +50,8 @@ class PartnerDiversity:
     players: tuple[Player, ...]
     counts: np.ndarray
     kinds: np.ndarray
+    count_names: tuple[str, ...]
+    kind_names: tuple[str, ...]
     diversity: Diversity
     chosen: tuple[int, ...]
     chosen_diversity: Diversity
@@ -65,10 +73,12 @@ class _EventCounter:
 
 
 class _Counts(NamedTuple):
-    """(K, 2, F) and (K, 2, F') mean counts of an episode by seat: HSP's events, and what BR-Div is of."""
+    """(K, 2, F) and (K, 2, F') mean counts of an episode by seat: HSP's events, and what BR-Div is of; their names."""
 
     events: np.ndarray
     kinds: np.ndarray
+    event_names: tuple[str, ...]
+    kind_names: tuple[str, ...]
     steps: int
 
 
@@ -115,7 +125,7 @@ def _count_by_seat(
     rows = _find_rows(players, kept)
     tables = (counts.reshape(len(kept), 2, episodes, 2, -1) for counts in (counter.counts, counter.kinds))
     events, kinds = (np.stack([table[:, seat, :, seat].mean(1) for seat in (0, 1)], 1)[rows] for table in tables)
-    return _Counts(events, kinds, played.steps)
+    return _Counts(events, kinds, name_player_events(env), name_diversity_events(env), played.steps)
 
 
 def _find_rows(players: Sequence[Player], kept: Sequence[int]) -> list[int]:
@@ -155,6 +165,8 @@ def measure_partners(
         players=tuple(players),
         counts=counts,
         kinds=kinds,
+        count_names=counted.event_names,
+        kind_names=tuple(f"{name}_seat_{seat}" for seat in (0, 1) for name in counted.kind_names),
         diversity=diversity,
         chosen=tuple(chosen),
         chosen_diversity=measure_diversity(kinds[chosen]),

@@ -13,8 +13,8 @@ Keys of the JSON object (`diversity.json`):
                              null for linearly dependent partners), effective_rank, rank, chosen (indices of partners),
                              chosen_log_determinant, chosen_effective_rank, kinds (a list for each partner, what BR-Div
                              is of: mean counts of `popgen.envs.player_events.BR_DIV_EVENTS` in seat 0, then in seat 1),
-                             counts (a list for each partner: of HSP's events, over both seats), spreads of these (a
-                             list: group, part as below, value, low, high)
+                             counts (a list for each partner: of HSP's events, over both seats), kind_names and
+                             count_names, spreads of the counts (a list: group, part as below, value, low, high)
     actions                  a list for the populations whose members can tell their probabilities: group, part (`all`,
                              or the skill or role that its members have), members, entropy, own_entropy, actions,
                              trajectories (objects: value, low, high, in nats), most, kernel
@@ -38,7 +38,7 @@ from popgen.population.manifest import EnvironmentInfo
 from popgen.reports.frames import Sheet, number_text, range_text, to_csv
 
 CSV_FIELDS = ("over", "partner", "member", "chosen")
-"""First columns of diversity.csv; a count for each kind of event follows."""
+"""First columns of diversity.csv; one for each event that is counted follows, event:NAME."""
 
 
 def describe_diversity(
@@ -91,6 +91,8 @@ def _describe_one(one: PartnerDiversity) -> dict[str, Any]:
         "chosen_effective_rank": one.chosen_diversity.effective_rank,
         "kinds": one.kinds.tolist(),
         "counts": one.counts.tolist(),
+        "kind_names": list(one.kind_names),
+        "count_names": list(one.count_names),
         "spreads": [{"group": group, "part": part, **asdict(spread)} for (group, part), spread in one.spreads.items()],
     }
 
@@ -179,7 +181,7 @@ def write_report(report: Mapping[str, Any], folder: str | Path) -> dict[str, Pat
         UserError: the folder cannot be written.
     """
     folder = Path(folder)
-    kinds = len(next(iter(report["over"].values()))["counts"][0])
+    columns = [f"event:{name}" for name in next(iter(report["over"].values()))["count_names"]]
     rows = [
         {
             **{
@@ -188,7 +190,7 @@ def write_report(report: Mapping[str, Any], folder: str | Path) -> dict[str, Pat
                 "member": partner["member"],
                 "chosen": int(n in one["chosen"]),
             },
-            **{f"event_{kind}": count for kind, count in enumerate(one["counts"][n])},
+            **dict(zip(columns, one["counts"][n], strict=True)),
         }
         for name, one in report["over"].items()
         for n, partner in enumerate(report["partners"])
@@ -198,7 +200,7 @@ def write_report(report: Mapping[str, Any], folder: str | Path) -> dict[str, Pat
     lines = "".join(f"- {line}\n" for line in list_lines(report))
     texts = {
         "json": json.dumps(report, indent=1, allow_nan=False) + "\n",
-        "csv": to_csv(rows, (*CSV_FIELDS, *(f"event_{kind}" for kind in range(kinds)))),
+        "csv": to_csv(rows, (*CSV_FIELDS, *columns)),
         "md": f"# {first.title}\n\n{first.to_markdown()}{tables}\n\n{lines}",
     }
     paths = {suffix: folder / f"diversity.{suffix}" for suffix in texts}

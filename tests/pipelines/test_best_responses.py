@@ -227,6 +227,10 @@ def test_diversity_is_printed_and_refuses_in_one_line(run: Run, tmp_path: Path) 
     code, out, err = run("diversity", str(held), "--episodes", "2", "--choose", "1")
     assert (code, err) == (0, "") and "0 of 2 partners have a best response" in out and "most diverse 1" in out
     assert {path.name for path in Path("diversity").iterdir()} == {f"diversity.{s}" for s in ("json", "csv", "md")}
+    told = json.loads(Path("diversity/diversity.json").read_text())["over"]["members"]
+    head = Path("diversity/diversity.csv").read_text().splitlines()[0].split(",")
+    assert head[4:] == [f"event:{name}" for name in told["count_names"]] and "event:delivery" in head
+    assert len(told["kind_names"]) == len(told["kinds"][0]) == 28 and told["kind_names"][0].endswith("_seat_0")
     code, out, err = run("diversity", str(held), "--choose", "3")
     assert code == 2 and "--choose" in err and err.count("\n") == 1
     copies = population(tmp_path / "copies", "lipo", 2, 2, 2, 3)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from support.small import kitchen
 
-from popgen.actors.ego_workers import open_training, read_partner
+from popgen.actors.ego_workers import list_distinct, open_training, read_partner
 from popgen.errors import UserError
 from popgen.methods.ego.config import EgoRun
 from popgen.methods.training import InlineTransport
@@ -17,7 +18,7 @@ from popgen.pipelines.ego_training import make_ego_config
 from popgen.pipelines.training_driver import TrainingDriver
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.simple_policies import RandomPolicy
-from popgen.population import PopulationWriter, load_population
+from popgen.population import Population, PopulationWriter, load_population
 from popgen.progress import NullReporter
 from popgen.runs.checkpoints import CheckpointFiles
 from popgen.runs.ledger import Ledger
@@ -118,6 +119,7 @@ def test_what_cannot_be_trained_is_told_in_one_line(partners: Path) -> None:
         ("mappo", [], {}, "method"),
         ("fcp", [str(partners)], {"ego.sequence": 7}, "ego.sequence"),
         ("hipt", [str(partners)], {"hipt.duration_most": 50}, "ego.unroll"),
+        ("fcp", [str(partners)], {"cluster.agent_gpus": 1.0}, "cluster.agent_gpus"),
     ):
         with pytest.raises(UserError) as caught:
             preflight(make_ego_config(method, named, {**SETTINGS, **settings}, scale="smoke"))
@@ -138,6 +140,15 @@ def test_a_population_means_each_of_its_policies_once(tmp_path: Path) -> None:
     preflight(config)
     with pytest.raises(UserError, match="a member twice"):
         preflight(make_ego_config("fcp", [f"{tmp_path / 'skills'}:2,3"], SETTINGS, scale="smoke"))
+
+
+def test_one_network_with_other_settings_is_another_partner(partners: Path) -> None:
+    """Clones of people may share a network and act differently."""
+    population = load_population(partners)
+    info = population.info(1)
+    infos = [info, info.model_copy(update={"config": {**info.config, "greedy": True}}), info.model_copy()]
+    three = SimpleNamespace(members=infos, env_info=population.env_info)
+    assert list_distinct(cast(Population, three)) == (1, 2)
 
 
 def test_partners_that_changed_are_refused(partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

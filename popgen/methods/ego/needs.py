@@ -13,8 +13,8 @@ MOST_PARTNERS = 64
 
 
 def list_actors(config: EgoRun) -> list[ActorDemand]:
-    """One learner, with its environments and partners."""
-    return [ask_for(config, "agent_cpus", 1, config.cluster.agent_gpus)]
+    """One learner, with its environments and partners; it computes on the CPU."""
+    return [ask_for(config, "agent_cpus", 1)]
 
 
 def estimate_needs(config: EgoRun, spec: EnvSpec) -> Needs:
@@ -53,12 +53,14 @@ def _check_alone(config: EgoRun) -> None:
 
 
 def check_run(config: EgoRun, spec: EnvSpec) -> None:
-    """Partners, unless the ego plays with itself; two players; the view of the network.
+    """No card; partners, unless the ego plays with itself; two players; the view of the network.
 
     Raises:
         UserError: what is missing or in vain.
     """
     ego, partners = config.ego, config.ego.partners
+    if config.cluster.agent_gpus > 0:
+        raise UserError("cluster.agent_gpus", "an ego learns on the CPU", "set cluster.agent_gpus=0")
     if config.plays_itself and partners:
         raise UserError("ego.partners", f"{config.method} plays with itself", "leave them out or choose another method")
     if not config.plays_itself and not partners:

@@ -81,7 +81,10 @@ def _make_recipes(own: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]])
     demo = Recipe("demo", "An ego that plays, in a minute or two.", {"ego.steps": 500_000}, base=laptop)
     smoke = Recipe("smoke", "Seconds, for tests: every code path once, nothing learned.", {**_HERE, **SMOKE_SETTINGS})
     published = Recipe(
-        "paper", "HiPT's published network, budget and rates, for a GPU.", {**_HERE, **PAPER_SETTINGS}, paper
+        "paper",
+        "HiPT's published network, budget and rates; it learns on the CPU, for days.",
+        {**_HERE, **PAPER_SETTINGS},
+        paper,
     )
     return {recipe.name: recipe for recipe in (laptop, demo, published, smoke)}
 
