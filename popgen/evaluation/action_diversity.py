@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from popgen.envs.contract import BatchedEnv
 from popgen.evaluation.holdout_metrics import Interval, bootstrap_interval
-from popgen.evaluation.holdout_players import Group, Player, find_mates
+from popgen.evaluation.holdout_players import Group, Player, seat_mates
 from popgen.losses.population_diversity import trajectory_divergence
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play
@@ -225,11 +225,12 @@ def measure_groups(
 
 def _add_mates(group: Group, players: Sequence[Player]) -> tuple[list[Player], list[int]]:
     """Players and after them those of their mates that are not of them; the place of each one's mate."""
-    mate_of = {id(group.players[n]): group.players[mate] for n, mate in enumerate(find_mates(group.players))}
+    together, places = seat_mates(group.players)
+    mate_of = {id(player): together[place] for player, place in zip(group.players, places, strict=True)}
     mates = [mate_of[id(player)] for player in players]
     everybody = list({id(player): player for player in (*players, *mates)}.values())
-    places = {id(player): place for place, player in enumerate(everybody)}
-    return everybody, [places[id(mate)] for mate in mates]
+    numbers = {id(player): number for number, player in enumerate(everybody)}
+    return everybody, [numbers[id(mate)] for mate in mates]
 
 
 def _list_parts(group: Group) -> dict[str, list[Player]]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from popgen.envs.contract import BatchedEnv
 from popgen.errors import UserError
-from popgen.evaluation.holdout_players import Group, Player, Response, find_mates, list_distinct
+from popgen.evaluation.holdout_players import Group, Player, Response, list_distinct, seat_mates
 from popgen.play.episodes import Episodes
 from popgen.play.policy import Policy
 from popgen.play.rollout import play_teams
@@ -111,11 +111,9 @@ class _Programme:
             raise UserError("holdout", "needs an ego and a partner at least")
         self.policies: list[Policy] = []
         self._seen: dict[str, int] = {}
-        egos, partners = casting.ego_players, casting.partner_players
-        self.egos = [self._add_player(player) for player in egos]
-        self.partners = [self._add_player(player) for player in partners]
-        self.ego_mates = _choose_mates(egos, self.egos)
-        self.partner_mates = _choose_mates(partners, self.partners)
+        partners = casting.partner_players
+        self.egos, self.ego_mates = self._add_players(casting.ego_players)
+        self.partners, self.partner_mates = self._add_players(partners)
         found = [casting.responses.get(player.identity or "") for player in partners]
         self.responses = [None if one is None else self._add_player(one.player) for one in found]
         spec = env.spec
@@ -126,6 +124,13 @@ class _Programme:
         self.numbers: dict[tuple[int, int], int] = {}
         for match in self._list_matches():
             self.numbers.setdefault(match, len(self.numbers))
+
+    def _add_players(self, players: Sequence[Player]) -> tuple[list[int], list[int | None]]:
+        """Their numbers, and those of their mates; None without one."""
+        everybody, mates = seat_mates(players)
+        numbers = [self._add_player(player) for player in everybody]
+        found = [None if mate == place else numbers[mate] for place, mate in enumerate(mates)]
+        return numbers[: len(players)], found
 
     def _add_player(self, player: Player) -> int:
         """Its number; that of an earlier one with the same policy, which is played once."""
@@ -165,11 +170,6 @@ class _Programme:
         nothing = np.full((len(SEATS), episodes), np.nan)
         pairs = zip(others, players, strict=True)
         return np.array([nothing if a is None else self.gather(played, episodes, [a], [b])[0, 0] for a, b in pairs])
-
-
-def _choose_mates(players: Sequence[Player], numbers: Sequence[int]) -> list[int | None]:
-    """Number of each one's mate; None without one."""
-    return [None if mate == place else numbers[mate] for place, mate in enumerate(find_mates(players))]
 
 
 def evaluate_holdout(

@@ -8,7 +8,7 @@ is no reference, and the partner has no BR-Prox in that seat.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +18,11 @@ from popgen.evaluation.holdout import SEATS, HoldoutResult
 from popgen.evaluation.holdout_metrics import (
     Interval,
     Spread,
+    bootstrap_crossed,
     bootstrap_gain,
-    bootstrap_units,
     describe_spread,
     interquartile_mean,
+    list_strata,
     measure_br_proximity,
     measure_cvar,
     measure_regret,
@@ -62,7 +63,8 @@ class Standing:
         count: partners, copies of one policy counted once.
         referenced: those with a reference in a seat at least, beside whom BR-Prox is measured.
         score: mean, SD over episodes and SE of the mean (SD over the root of all episodes, as in the paper).
-        interval: of the mean: over the ego's seeds, or over partners where it has one seed; NaN for one of each.
+        interval: of the mean, over what is resampled; NaN where that is nothing.
+        resampled: of `ego's seeds` and `partners`, within their groups, those of which there are several.
         seats: mean by the ego's seat.
         worst: the lowest pair.
         cvar: mean of the lowest quarter of pair means.
@@ -80,6 +82,7 @@ class Standing:
     referenced: int
     score: Spread
     interval: Interval
+    resampled: tuple[str, ...]
     seats: tuple[float, float]
     worst: Worst
     cvar: float
@@ -160,6 +163,7 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
     means, references = scores.mean(-1), find_references(result)[columns]
     best = np.fmax(references, result.scores.mean(-1).max(0)[columns])
     unclipped = measure_br_proximity(means, references, clip=False)
+    groups = _list_groups(result, columns)
     useful = best > 0.0
     normalised = normalise_returns(means[:, useful], 0.0, best[useful]) if useful.any() else np.array([math.nan])
     return Standing(
@@ -168,11 +172,12 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
         count=len(columns),
         referenced=int((references > 0.0).any(1).sum()),
         score=describe_spread(scores),
-        interval=_bound_figure(means, np.mean),
+        interval=bootstrap_crossed(means, groups, np.mean, repetitions=REPETITIONS),
+        resampled=list_resampled({"ego's seeds": len(means)}, groups),
         seats=(float(means[..., 0].mean()), float(means[..., 1].mean())),
         worst=_find_worst_pair(result, rows, columns),
         cvar=measure_cvar(means, CVAR_SHARE),
-        br_prox=_bound_proximity(measure_br_proximity(means, references)),
+        br_prox=_bound_proximity(measure_br_proximity(means, references), groups),
         br_prox_unclipped=float(np.nanmean(unclipped)) if np.isfinite(unclipped).any() else math.nan,
         br_prox_least=_find_least_share(unclipped),
         normalised=float(normalised.mean()),
@@ -180,17 +185,27 @@ def describe_standing(result: HoldoutResult, ego: Group, chosen: PartnerSet) -> 
     )
 
 
-def _bound_figure(values: np.ndarray, estimate: Callable[[np.ndarray], float] = interquartile_mean) -> Interval:
-    """Interval of a figure of (runs, K, 2): over whole runs, or where there is one over partners with both seats."""
-    return bootstrap_units(values if len(values) > 1 else values[0], estimate, repetitions=REPETITIONS)
+def list_resampled(seeds: Mapping[str, int], groups: Sequence[int]) -> tuple[str, ...]:
+    """What an interval is over: seeds by whose they are, and partners of one group, wherever there are several."""
+    counts = {**seeds, "partners": max(len(own) for own in list_strata(groups))}
+    return tuple(name for name, count in counts.items() if count > 1)
 
 
-def _bound_proximity(clipped: np.ndarray) -> Interval:
-    """The same of BR-Prox (runs, K, 2), over the partners and seats that have one."""
-    kept = clipped[:, np.isfinite(clipped).any((0, 2))]
+def _list_groups(result: HoldoutResult, columns: Sequence[int]) -> list[int]:
+    """Of each of some partners the number of its group."""
+    of_all = [number for number, group in enumerate(result.casting.partners) for _ in group.players]
+    return [of_all[column] for column in columns]
+
+
+def _bound_proximity(clipped: np.ndarray, groups: Sequence[int]) -> Interval:
+    """Of BR-Prox (runs, K, 2) the inter-quartile mean, over the partners and seats that have one."""
+    kept = np.flatnonzero(np.isfinite(clipped).any((0, 2)))
     if not kept.size:
         return Interval(math.nan, math.nan, math.nan)
-    return _bound_figure(kept, lambda drawn: interquartile_mean(drawn[np.isfinite(drawn)]))
+    own = [groups[place] for place in kept]
+    return bootstrap_crossed(
+        clipped[:, kept], own, lambda drawn: interquartile_mean(drawn[np.isfinite(drawn)]), repetitions=REPETITIONS
+    )
 
 
 def _find_least_share(ratios: np.ndarray) -> float:
@@ -231,8 +246,8 @@ def measure_margins(result: HoldoutResult, control: str) -> list[Margin]:
         for chosen in list_sets(result, ego):
             if chosen.label not in (OWN, CROSS):
                 columns = list(chosen.columns)
-                gain = bootstrap_gain(own[:, columns], base[:, columns], repetitions=REPETITIONS)
-                counts = {"ego's seeds": len(own), "control's seeds": len(base), "partners": len(columns)}
-                several = tuple(name for name, count in counts.items() if count > 1)
+                groups = _list_groups(result, columns)
+                gain = bootstrap_gain(own[:, columns], base[:, columns], groups, repetitions=REPETITIONS)
+                several = list_resampled({"ego's seeds": len(own), "control's seeds": len(base)}, groups)
                 found.append(Margin(ego.label, control, chosen.label, gain, several))
     return found

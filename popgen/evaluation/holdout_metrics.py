@@ -12,7 +12,7 @@ beside pandas 3 (it pins arch 7.2).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,7 +118,7 @@ def bootstrap_interval(
 
     Args:
         scores: (R, T): R independent samples of each of T tasks. They are resampled within each task; see
-            `bootstrap_units` for samples that belong together from task to task.
+            `bootstrap_crossed` for samples that belong together from task to task.
         estimate: scores -> figure.
         over_tasks: resample the tasks too, for a statement about other partners; the only choice with one run.
         repetitions, level, seed: of the bootstrap.
@@ -137,49 +137,71 @@ def bootstrap_interval(
     return Interval(float(estimate(scores)), float(low), float(high))
 
 
-def bootstrap_units(
-    values: np.ndarray, estimate: Callable[[np.ndarray], float], *, repetitions: int = 2000
+def bootstrap_crossed(
+    values: np.ndarray, groups: Sequence[int], estimate: Callable[[np.ndarray], float], *, repetitions: int = 2000
 ) -> Interval:
-    """An estimate with its 95 % percentile bootstrap interval over independent units, each drawn with all that it has.
+    """An estimate with its 95 % percentile bootstrap interval over runs and over partners, wherever there are several.
 
-    What one policy scores beside many others is not independent: a strong one is strong beside all of them. Drawn anew
-    for each of them, as `bootstrap_interval` draws runs, these scores would give an interval that is far too narrow.
+    Runs are drawn whole: what one policy scores beside many others is not independent, and drawn anew for each of them
+    (`bootstrap_interval`) these scores would give an interval that is far too narrow. Partners are drawn with all their
+    seats, within each group (stratified): how many of them are of one population is not by chance. With few runs the
+    interval is still too narrow: with three, one in four misses the truth.
 
     Args:
-        values: (U, ...), one row for each of U units, such as the seeds of an ego, or partners with both their seats.
+        values: (R, K, P) of R runs beside K partners in P seats.
+        groups: of each of the K partners.
         estimate: values -> figure.
         repetitions: of the bootstrap.
 
     Returns:
-        The figure of all; low and high are NaN for one unit, which tells nothing of others.
+        The figure of all; low and high are NaN where there is one run and no two partners of a group.
 
     Raises:
-        ValueError: there are no values.
+        ValueError: there are no values, or they are not of as many partners as `groups`.
     """
     values = np.asarray(values, np.float64)
-    if not values.size:
-        raise ValueError(f"values: there are none in shape {values.shape}")
-    figure, units = float(estimate(values)), len(values)
-    if units == 1:
+    if values.ndim != 3 or not values.size:
+        raise ValueError(f"values: expected (runs, partners, seats), got shape {values.shape}")
+    check(values, (len(values), len(groups), values.shape[2]), "values")
+    figure, runs, strata = float(estimate(values)), len(values), list_strata(groups)
+    if runs == max(map(len, strata)) == 1:
         return Interval(figure, math.nan, math.nan)
-    rng = np.random.default_rng(0)
-    drawn = [estimate(values[rng.integers(units, size=units)]) for _ in range(repetitions)]
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(repetitions):
+        columns = draw_within(strata, rng)
+        rows = rng.integers(runs, size=runs) if runs > 1 else np.zeros(1, np.int64)
+        drawn.append(estimate(values[np.ix_(rows, columns)]))
     low, high = np.quantile(drawn, [0.025, 0.975])
     return Interval(figure, float(low), float(high))
 
 
-def bootstrap_gain(own: np.ndarray, base: np.ndarray, *, repetitions: int = 2000) -> Interval:
+def list_strata(groups: Sequence[int]) -> list[np.ndarray]:
+    """Places of each group's members, in the order of the groups."""
+    places = np.asarray(groups)
+    return [np.flatnonzero(places == group) for group in dict.fromkeys(groups)]
+
+
+def draw_within(strata: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """As many places as there are, drawn with replacement within each stratum."""
+    return np.concatenate([own[rng.integers(len(own), size=len(own))] for own in strata])
+
+
+def bootstrap_gain(
+    own: np.ndarray, base: np.ndarray, groups: Sequence[int] | None = None, *, repetitions: int = 2000
+) -> Interval:
     """How much larger one mean is than another over the same partners, with its 95 % percentile bootstrap interval.
 
     Drawn anew are the runs of either, each on its own, and the partners, which both have in common and which are drawn
-    whole, with all their seats. What there is one of stays as it is.
+    whole, with all their seats, within their groups. What there is one of stays as it is.
 
     Args:
         own, base: (R, K, P) and (S, K, P) mean scores of R and of S runs beside K partners.
+        groups: of each of the K partners; without them all are one group.
         repetitions: of the bootstrap.
 
     Returns:
-        Mean of `own` less mean of `base`; low and high are NaN where there is one run of either and one partner.
+        Mean of `own` less mean of `base`; low and high are NaN where there is one run of either and one partner of each
+        group.
 
     Raises:
         ValueError: there are no values, or not the same partners.
@@ -189,12 +211,13 @@ def bootstrap_gain(own: np.ndarray, base: np.ndarray, *, repetitions: int = 2000
         raise ValueError(f"own, base: expected (runs, partners, seats), got shapes {own.shape} and {base.shape}")
     check(base, (len(base), *own.shape[1:]), "base")
     gain, (runs, partners, _), controls = float(own.mean() - base.mean()), own.shape, len(base)
-    if runs == partners == controls == 1:
+    strata = list_strata([0] * partners if groups is None else groups)
+    if runs == controls == max(map(len, strata)) == 1:
         return Interval(gain, math.nan, math.nan)
     own, base = own.mean(-1), base.mean(-1)
     rng, drawn = np.random.default_rng(0), []
     for _ in range(repetitions):
-        columns = rng.integers(partners, size=partners)
+        columns = draw_within(strata, rng)
         rows, others = rng.integers(runs, size=runs), rng.integers(controls, size=controls)
         drawn.append(own[np.ix_(rows, columns)].mean() - base[np.ix_(others, columns)].mean())
     low, high = np.quantile(drawn, [0.025, 0.975])

@@ -56,6 +56,9 @@ def _check_members(ego: Group, partner: Group) -> None:
         if player.digest in beside:
             what = "a training partner of" if player.digest in met else "of a population that trained"
             raise UserError(player.source, f"member {player.member} is {what} the ego {ego.label}", _OTHERS)
+    if _gather_digests(partner.lineages) & (own | beside):
+        problem = f"is of a population that holds members of the ego {ego.label} or of those that trained it"
+        raise UserError(partner.label, problem, _OTHERS)
     theirs = _gather_digests(partner.partners)
     if theirs & own:
         raise UserError(partner.label, f"was trained with the ego {ego.label} itself", _OTHERS)

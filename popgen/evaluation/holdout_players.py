@@ -7,7 +7,7 @@ ordinary population folder; what it was trained with stands in its members' reco
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from popgen.evaluation.holdout_lineages import (
 )
 from popgen.evaluation.user_agents import is_agent_name, open_user_agent
 from popgen.play.policy import Policy
-from popgen.population import Population, load_population
+from popgen.population import Population
+from popgen.population.chosen_members import ChosenMembers, load_members
 from popgen.population.manifest import EnvironmentInfo, MemberInfo
 from popgen.population.member_pairs import match_pairs, read_pair
 
@@ -45,6 +46,7 @@ class Player:
         pair: number of the pair that it was trained in (HSP), 0 for a member that was trained with itself.
         identity: sha256 of all that decides how it acts (`identify_member`), None for a user's agent. Players with one
             identity are the same policy, which counts once.
+        mate: the other of its pair, where that was not chosen to play too.
     """
 
     group: str
@@ -55,6 +57,7 @@ class Player:
     part: str = ""
     pair: int = 0
     identity: str | None = None
+    mate: Player | None = None
 
     @property
     def name(self) -> str:
@@ -118,20 +121,20 @@ def open_sides(wanted: Mapping[str, Sequence[tuple[str | None, str]]], title: Ca
     """Load the groups of players of all sides.
 
     Args:
-        wanted: side -> (label or None, folder of a population or run, or `module:Agent`); one label twice on a side
-            makes one group.
+        wanted: side -> (label or None, folder of a population or run, with `:1,3` behind it for some members only, or
+            `module:Agent`); one label twice on a side makes one group.
         title: a method's name -> label of populations that were given none.
 
     Raises:
-        UserError: what cannot be loaded, an empty population, one given twice among egos or among partners, none at
-            all, two of different environments, or one label on two sides of partners.
+        UserError: what cannot be loaded, an empty population, a member given twice among egos or among partners, none
+            at all, two of different environments, or one label on two sides of partners.
     """
-    populations: dict[str, Population] = {}
+    populations: dict[str, ChosenMembers] = {}
     for source in (source for named in wanted.values() for _, source in named):
         if source not in populations and not is_agent_name(source):
-            populations[source] = load_population(source)
+            populations[source] = load_members(source)
     environment: EnvironmentInfo | None = None
-    for population in populations.values():
+    for population in (chosen.population for chosen in populations.values()):
         if not len(population):
             raise UserError(str(population.path), "has no members yet", "train at least one first")
         environment = environment or population.env_info
@@ -144,7 +147,8 @@ def open_sides(wanted: Mapping[str, Sequence[tuple[str | None, str]]], title: Ca
         found: dict[str, Group] = {}
         for label, source in named:
             if source in populations:
-                group = _describe_population(label or title(populations[source].manifest.method), populations[source])
+                chosen = populations[source]
+                group = _describe_population(label or title(chosen.population.manifest.method), chosen)
             else:
                 group = _describe_agent(label or source.rpartition(":")[2], source, rules)
             found[group.label] = _join_groups(found[group.label], group) if group.label in found else group
@@ -154,18 +158,20 @@ def open_sides(wanted: Mapping[str, Sequence[tuple[str | None, str]]], title: Ca
 
 
 def _check_groups(sides: Mapping[str, Sequence[Group]]) -> None:
-    """A population counts once among egos and once among partners, and a label of partners has one side."""
+    """A member counts once among egos and once among partners, and a label of partners has one side."""
     labels: dict[str, str] = {}
-    places: set[tuple[bool, str]] = set()
+    places: set[tuple[bool, str, int]] = set()
     for side, groups in sides.items():
         for group in groups:
             if side != EGO and labels.setdefault(group.label, side) != side:
                 problem = f"is on two sides, {labels[group.label]} and {side}"
                 raise UserError(group.label, problem, "give them different names: NAME=POPULATION")
-            for source in dict.fromkeys(player.source for player in group.players):
-                place = (side == EGO, source if is_agent_name(source) else str(Path(source).resolve()))
-                if place in places:
-                    raise UserError(source, "is given twice", "give each once")
+            for player in group.players:
+                agent = is_agent_name(player.source)
+                source = player.source if agent else str(Path(player.source).resolve())
+                if (place := (side == EGO, source, player.member)) in places:
+                    which = "" if agent else f"member {player.member} "
+                    raise UserError(player.source, f"{which}is given twice", "give each once")
                 places.add(place)
 
 
@@ -180,8 +186,16 @@ def _check_environment(population: Population, environment: EnvironmentInfo) -> 
         )
 
 
-def _describe_population(label: str, population: Population) -> Group:
-    players = tuple(_describe_member(label, population, info) for info in population.members)
+def _describe_population(label: str, chosen: ChosenMembers) -> Group:
+    """The chosen members; where they come from tells of all."""
+    population = chosen.population
+    everybody = [_describe_member(label, population, info) for info in population.members]
+    mates = find_mates(everybody)
+    apart = {n for n in chosen.members if mates[n - 1] + 1 not in chosen.members}
+    players = tuple(
+        replace(everybody[n - 1], mate=everybody[mates[n - 1]]) if n in apart else everybody[n - 1]
+        for n in chosen.members
+    )
     partners = [one for info in population.members for one in read_partners(str(population.path), info.extra)]
     on_record = all(is_on_record(info.extra) for info in population.members)
     own = (describe_lineage(population),)
@@ -202,6 +216,16 @@ def find_mates(players: Sequence[Player]) -> tuple[int, ...]:
     return match_pairs([(one.source, one.pair) if one.pair else None for one in players])
 
 
+def seat_mates(players: Sequence[Player]) -> tuple[list[Player], list[int]]:
+    """The players, after them their mates that were not chosen, and the place of each player's mate as above."""
+    everybody, places = list(players), list(find_mates(players))
+    for place, player in enumerate(players):
+        if places[place] == place and player.mate is not None:
+            places[place] = len(everybody)
+            everybody.append(player.mate)
+    return everybody, places
+
+
 def list_distinct(players: Sequence[Player]) -> list[int]:
     """Places of the players that are no copy of an earlier one; users' agents are none."""
     known = [one.identity for one in players]
@@ -216,13 +240,11 @@ def _join_groups(first: Group, second: Group) -> Group:
     if first.method != second.method:
         problem = f"names {first.method or 'an agent'} and {second.method or 'an agent'}"
         raise UserError(first.label, problem, "give them different names")
-    if shared := {player.source for player in first.players} & {player.source for player in second.players}:
-        raise UserError(shared.pop(), "is given twice", "give each once")
     return Group(
         first.label,
         first.method,
         first.players + second.players,
-        first.lineages + second.lineages,
+        tuple(dict.fromkeys(first.lineages + second.lineages)),
         tuple(dict.fromkeys(first.partners + second.partners)),
         first.on_record and second.on_record,
     )

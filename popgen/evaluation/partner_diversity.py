@@ -24,7 +24,7 @@ from popgen.envs.player_events import (
 )
 from popgen.errors import UserError
 from popgen.evaluation.holdout_metrics import Interval
-from popgen.evaluation.holdout_players import Player, find_mates, list_distinct
+from popgen.evaluation.holdout_players import Player, list_distinct, seat_mates
 from popgen.play.event_diversity import Diversity, choose_most_diverse, measure_distances, measure_diversity
 from popgen.play.policy import Policy
 from popgen.play.rollout import Transition, play
@@ -111,11 +111,12 @@ def _count_by_seat(
     episodes: int,
     seed: int,
 ) -> _Counts:
-    policies: list[Policy] = [player.make() for player in players]
-    beside = list(enumerate(find_mates(players)))
+    everybody, mates = seat_mates(players)
+    beside = list(enumerate(mates))
     if responses is not None:
+        everybody = [*players, *responses]
         beside = [(len(players) + k, k) for k in range(len(players))]
-        policies += [player.make() for player in responses]
+    policies: list[Policy] = [player.make() for player in everybody]
     kept = list_distinct(players)
     # The one whose events count sits in seat 0, then in seat 1.
     matches = [seats for k in kept for seats in (beside[k], beside[k][::-1])]

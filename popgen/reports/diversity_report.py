@@ -11,6 +11,7 @@ Keys of the JSON object (`diversity.json`):
     training                 scale and settings (dotted field -> value on top of it) of best responses
     over                     `members`, and `best responses` where all have one: determinant, log_determinant (0 and
                              null for linearly dependent partners), effective_rank, rank, chosen (indices of partners),
+                             hold_out (the same as arguments of `popgen evaluate --with`, a word for each population),
                              chosen_log_determinant, chosen_effective_rank, kinds (a list for each partner, what BR-Div
                              is of: mean counts of `popgen.envs.player_events.BR_DIV_EVENTS` in seat 0, then in seat 1),
                              counts (a list for each partner: of HSP's events, over both seats), kind_names and
@@ -23,6 +24,7 @@ Keys of the JSON object (`diversity.json`):
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -32,8 +34,11 @@ import pandas as pd
 
 from popgen.errors import UserError
 from popgen.evaluation.action_diversity import MeasuredActions
+from popgen.evaluation.holdout_players import Player
 from popgen.evaluation.partner_diversity import PartnerDiversity
+from popgen.evaluation.user_agents import is_agent_name
 from popgen.jsonable import jsonable
+from popgen.population.chosen_members import join_members
 from popgen.population.manifest import EnvironmentInfo
 from popgen.reports.frames import Sheet, number_text, range_text, to_csv
 
@@ -87,6 +92,7 @@ def _describe_one(one: PartnerDiversity) -> dict[str, Any]:
         "effective_rank": one.diversity.effective_rank,
         "rank": one.diversity.rank,
         "chosen": list(one.chosen),
+        "hold_out": list_arguments([one.players[n] for n in one.chosen]),
         "chosen_log_determinant": one.chosen_diversity.log_determinant,
         "chosen_effective_rank": one.chosen_diversity.effective_rank,
         "kinds": one.kinds.tolist(),
@@ -95,6 +101,17 @@ def _describe_one(one: PartnerDiversity) -> dict[str, Any]:
         "count_names": list(one.count_names),
         "spreads": [{"group": group, "part": part, **asdict(spread)} for (group, part), spread in one.spreads.items()],
     }
+
+
+def list_arguments(players: Sequence[Player]) -> list[str]:
+    """NAME=PATH:1,3 for each population of some players, and users' agents as they are."""
+    members = dict[tuple[str, str], tuple[int, ...]]()
+    for one in players:
+        members[one.group, one.source] = (*members.get((one.group, one.source), ()), one.member)
+    return [
+        f"{group}={source if is_agent_name(source) else join_members(source, numbers)}"
+        for (group, source), numbers in members.items()
+    ]
 
 
 def make_sheet(report: Mapping[str, Any]) -> Sheet:
@@ -156,6 +173,7 @@ def list_lines(report: Mapping[str, Any]) -> list[str]:
         if len(one["chosen"]) < len(partners):
             names = ", ".join(f"{partners[n]['group']} {partners[n]['member']}" for n in one["chosen"])
             lines.append(f"most diverse {len(one['chosen'])} over {name}: {names}")
+            lines.append(f"to hold these out: popgen evaluate EGO --with {shlex.join(one['hold_out'])}")
         if one["rank"] < len(partners):
             told = f"over {name} only {one['rank']} of {len(partners)} partners are linearly independent"
             lines.append(f"{told}: the determinant is 0, its logarithm has no value")

@@ -48,7 +48,7 @@ from popgen.evaluation.holdout_figures import (
     measure_margins,
 )
 from popgen.evaluation.holdout_metrics import describe_spread
-from popgen.evaluation.holdout_players import Group, Response, find_mates, list_distinct
+from popgen.evaluation.holdout_players import Group, Response, list_distinct, seat_mates
 from popgen.jsonable import jsonable
 from popgen.reports.frames import to_csv
 from popgen.reports.paper_ego_figures import list_cells
@@ -85,16 +85,17 @@ def to_dict(result: HoldoutResult, control: str | None = None) -> dict[str, Any]
 
 
 def _describe_group(result: HoldoutResult, group: Group) -> dict[str, Any]:
+    everybody, mates = seat_mates(group.players)
     players = [
         {
             "source": one.source,
             "member": one.member,
             "sha256": one.digest,
             "identity": one.identity,
-            "mate": None if mate == place else group.players[mate].member,
+            "mate": None if mate == place else everybody[mate].member,
             "response": _describe_response(result.casting.responses.get(one.identity or "")),
         }
-        for place, (one, mate) in enumerate(zip(group.players, find_mates(group.players), strict=True))
+        for place, (one, mate) in enumerate(zip(group.players, mates, strict=True))
     ]
     apart = {"human": group.label in result.casting.humans, "met": group.label in result.casting.met}
     taught = sorted(group.taught_by)
@@ -112,6 +113,7 @@ def _describe_standing(one: Standing) -> dict[str, Any]:
         **{"ego": one.ego, "partners": one.partners, "count": one.count, "referenced": one.referenced},
         **{"mean": one.score.mean, "sd": one.score.sd, "se": one.score.se},
         "interval": {"low": one.interval.low, "high": one.interval.high},
+        "resampled": list(one.resampled),
         **{"seat_0": one.seats[0], "seat_1": one.seats[1]},
         "worst": asdict(one.worst),
         "cvar_25": one.cvar,
@@ -178,8 +180,8 @@ _MARGINS = (
 
 def _write_notes(result: HoldoutResult) -> list[str]:
     return [
-        "SD is over episodes, SE = SD / sqrt(episodes); intervals (95 %) draw an ego's seeds anew and keep the "
-        "partners, or draw partners anew where it has one seed. Those over few seeds are too narrow.",
+        "SD is over episodes, SE = SD / sqrt(episodes); intervals (95 %) draw partners anew within their population, "
+        "and an ego's seeds, wherever there are several. Those over few seeds are too narrow.",
         *_write_reference_notes(result),
         *_write_response_notes(result),
         *_write_origin_notes(result),

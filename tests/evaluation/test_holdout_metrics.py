@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from popgen.evaluation.holdout_metrics import (
+    bootstrap_crossed,
     bootstrap_gain,
     bootstrap_interval,
-    bootstrap_units,
     describe_spread,
     interquartile_mean,
     measure_br_proximity,
@@ -81,24 +81,45 @@ def test_runs_are_resampled_within_tasks() -> None:
     assert free.low < 30 and free.high > 40
 
 
-def test_units_are_drawn_with_all_that_they_have() -> None:
+def mean_of(drawn: np.ndarray) -> float:
+    return float(drawn.mean())
+
+
+def test_runs_and_partners_are_drawn_with_all_that_they_have() -> None:
     """Two seeds, one 4 better beside each of 50 partners: half of all draws of two are of one seed alone."""
-    scores = np.stack([np.full(100, 3.0), np.full(100, 7.0)])
-    together = bootstrap_units(scores, lambda drawn: float(drawn.mean()))
+    scores = np.stack([np.full((50, 2), 3.0), np.full((50, 2), 7.0)])
+    together = bootstrap_crossed(scores, [0] * 50, mean_of)
     assert (together.value, together.low, together.high) == (5.0, 3.0, 7.0)
-    assert bootstrap_units(scores, interquartile_mean) == bootstrap_units(scores, interquartile_mean)
-    alone = bootstrap_units(scores[:1], interquartile_mean)
+    again = [bootstrap_crossed(scores, [0] * 50, interquartile_mean) for _ in range(2)]
+    assert again[0] == again[1]
+    alone = bootstrap_crossed(scores[:1, :1], [0], interquartile_mean)
     assert alone.value == 3.0 and math.isnan(alone.low) and math.isnan(alone.high)
-    with pytest.raises(ValueError, match="none"):
-        bootstrap_units(np.zeros((0, 3)), interquartile_mean)
+    for wrong, groups in ((np.zeros((0, 3, 2)), [0] * 3), (scores, [0] * 49), (scores[0], [0] * 50)):
+        with pytest.raises(ValueError, match="values"):
+            bootstrap_crossed(wrong, groups, mean_of)
 
 
-def test_intervals_of_units_hold_the_truth_about_as_often_as_they_say() -> None:
+def test_partners_are_drawn_within_their_groups() -> None:
+    """Eight partners at 4 and eight at 8: as two groups no draw differs, as one the share of either does."""
+    scores = np.repeat([4.0, 8.0], 8)[None, :, None].repeat(2, axis=2)
+    apart = bootstrap_crossed(scores, [0] * 8 + [1] * 8, mean_of)
+    assert (apart.low, apart.value, apart.high) == (6.0, 6.0, 6.0)
+    mixed = bootstrap_crossed(scores, [0] * 16, mean_of)
+    assert mixed.low < 5.25 and mixed.high > 6.75
+    single = bootstrap_crossed(scores[:, [0, 8]], [0, 1], mean_of)  # nothing is drawn: one of each group, one run
+    assert single.value == 6.0 and math.isnan(single.low)
+    gain = bootstrap_gain(scores, scores - 1.0, [0] * 8 + [1] * 8)
+    assert (gain.low, gain.value, gain.high) == (1.0, 1.0, 1.0)
+    nothing = bootstrap_gain(scores[:, [0, 8]], scores[:, [0, 8]], [0, 1])
+    assert nothing.value == 0.0 and math.isnan(nothing.low)
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     """Each of 32 partners has a level of its own in both seats: seats drawn apart hold the mean far less often."""
     rng, held = np.random.default_rng(1), 0
     for _ in range(200):
-        levels = rng.normal(5.0, 1.0, (32, 1)) + rng.normal(0.0, 0.1, (32, 2))
-        found = bootstrap_units(levels, lambda drawn: float(drawn.mean()), repetitions=200)
+        levels = rng.normal(5.0, 1.0, (1, 32, 1)) + rng.normal(0.0, 0.1, (1, 32, 2))
+        found = bootstrap_crossed(levels, [0] * 32, mean_of, repetitions=200)
         held += found.low <= 5.0 <= found.high
     assert 0.9 <= held / 200 <= 0.98
 
@@ -135,7 +156,7 @@ def test_a_gain_draws_the_partners_of_both_sides_together() -> None:
 
 def test_a_gain_of_one_seed_over_one_is_bootstrapped_over_partners_alone() -> None:
     own, base = np.random.default_rng(3).normal(size=(2, 1, 7, 2))
-    of_units = bootstrap_units((own - base)[0], lambda drawn: float(drawn.mean()))
+    of_units = bootstrap_crossed(own - base, [0] * 7, mean_of)
     gain = bootstrap_gain(own, base)
     for mine, theirs in ((gain.value, of_units.value), (gain.low, of_units.low), (gain.high, of_units.high)):
         assert mine == pytest.approx(theirs)

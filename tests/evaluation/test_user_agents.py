@@ -11,6 +11,7 @@ import pytest
 from popgen.envs import make_env
 from popgen.errors import UserError
 from popgen.evaluation.user_agents import is_agent_name, open_user_agent
+from popgen.play.policy import Policy
 from popgen.play.rollout import play
 from popgen.policies.simple_policies import IdlePolicy, RandomPolicy
 
@@ -42,6 +43,100 @@ class Hidden(North):
 class Viewless(North):
     view = ["features"]
 
+class Answers(North):
+    "Gives one answer for each row and seat."
+    answer = np.int64(0)
+    def act(self, obs, previous_actions, is_first): return np.full(obs.shape[:2], self.answer)
+
+class Wraps(Answers): answer = np.int64(260)
+class Cut(Answers): answer = 1.7
+class Whole(Answers): answer = 1.0
+class Above(Answers): answer = np.uint8(9)
+class Below(Answers): answer = np.int8(-1)
+class Yes(Answers): answer = True
+
+class Flat(North):
+    def act(self, obs, previous_actions, is_first): return np.zeros(len(obs), np.int64)
+
+class Ragged(North):
+    def act(self, obs, previous_actions, is_first): return [[0, 1], [2]]
+
+class Silent(North):
+    def act(self, obs, previous_actions, is_first): pass
+
+class Lists(North):
+    def act(self, obs, previous_actions, is_first): return [[5, 4]] * len(obs)
+
+class Crashes(North):
+    def act(self, obs, previous_actions, is_first):
+        return self.table[0]
+
+class Unready(North):
+    def reset(self, batch, seed): raise OSError("no weights")
+
+class Leaves(North):
+    def reset(self, batch, seed): raise SystemExit(3)
+
+class Seedless(North):
+    def reset(self, batch): pass
+
+class Blind(North):
+    def act(self, obs): pass
+
+class Tires(North):
+    "Its fourth action is one that there is not."
+    def reset(self, batch, seed): self.step = 0
+    def act(self, obs, previous_actions, is_first):
+        self.step += 1
+        return np.full(obs.shape[:2], 6 if self.step == 4 else 0)
+
+class Counts(North):
+    "Its action is the number of the step, modulo four; made once for all."
+    def reset(self, batch, seed): self.step = 0
+    def act(self, obs, previous_actions, is_first):
+        self.step += 1
+        return np.full(obs.shape[:2], (self.step - 1) % 4)
+
+one_for_all = Counts()
+def share(): return one_for_all
+
+class Locked(Counts):
+    def __init__(self):
+        from threading import Lock
+        self.lock = Lock()
+
+locked = Locked()
+def share_locked(): return locked
+
+class Network(Counts):
+    "Called like a network, which must not make it."
+    def __call__(self, x): raise RuntimeError("no x")
+network = Network()
+
+class Seven(Agent):
+    def action(self, state): return 7
+class Bare(Agent):
+    def action(self, state): return Action.STAY
+class Number(Agent):
+    def action(self, state): return 4, {}
+class Stateless(Agent):
+    def action(self): return Action.STAY, {}
+class Fails(Agent):
+    def action(self, state): return {}["key"]
+
+class Remembers(Agent):
+    "Its first action is its seat's, and the one after that its own last."
+    def reset(self): self.last = None
+    def action(self, state):
+        self.last = self.agent_index if self.last is None else self.last
+        return Action.INDEX_TO_ACTION[self.last], {}
+remembers = Remembers()
+def share_agent(): return remembers
+
+def load_own():
+    from popgen.policies.simple_policies import RandomPolicy
+    return RandomPolicy(6)
+
 def leave(): raise SystemExit(3)
 stay = StayAgent()
 def broken(): raise RuntimeError("no model here")
@@ -71,7 +166,9 @@ def test_names_are_told_from_folders(tmp_path: Path) -> None:
 def test_policies_are_made_from_classes_functions_and_objects() -> None:
     make = open_user_agent("their_agents:North", ENV)
     assert make() is not make()
-    assert open_user_agent("their_agents:Sized", ENV)().actions == 6  # type: ignore[attr-defined]
+    sized = open_user_agent("their_agents:Sized", ENV)()
+    assert sized.view == "features" and sized.kind == "user_agent"
+    assert isinstance(open_user_agent("their_agents:load_own", ENV)(), RandomPolicy)  # which is popgen's own
 
 
 @pytest.mark.usefixtures("module")
@@ -148,3 +245,98 @@ def test_a_dependency_that_is_missing_is_named() -> None:
 def test_agents_of_overcooked_ai_play_overcooked_alone() -> None:
     with pytest.raises(UserError, match="another game"):
         open_user_agent("their_agents:stay", make_env("rendezvous/mppmr", 1))
+
+
+# ---- what they answer ------------------------------------------------------------------------------------------------
+
+RANGE = "; give a whole number from 0 to 5 for each row and seat"
+
+
+@pytest.mark.usefixtures("module")
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("Wraps", f"act gives the action 260{RANGE}"),
+        ("Above", f"act gives the action 9{RANGE}"),
+        ("Below", f"act gives the action -1{RANGE}"),
+        ("Cut", f"act gives actions of dtype float64{RANGE}"),
+        ("Whole", f"act gives actions of dtype float64{RANGE}"),
+        ("Yes", f"act gives actions of dtype bool{RANGE}"),
+        ("Silent", f"act gives actions of dtype object{RANGE}"),
+        ("Flat", f"act gives an array of shape (2,), not (2, 2){RANGE}"),
+        ("Ragged", "act gives no array (ValueError: setting an array element"),
+        (
+            "Crashes",
+            "fails in act (AttributeError: 'Crashes' object has no attribute 'table'); correct their_agents.py",
+        ),
+        ("Unready", "fails in reset (OSError: no weights); correct their_agents.py, line "),
+        ("Leaves", "fails in reset (SystemExit: 3); correct their_agents.py, line "),
+        ("Seedless", "positional arguments but 3 were given); define it as reset(self, batch, seed)"),
+        ("Blind", "were given); define it as act(self, obs, previous_actions, is_first)"),
+        ("Seven", "action gives 7; give (action, info), the action one of overcooked_ai's Action.ALL_ACTIONS"),
+        ("Bare", "action gives (0, 0); give (action, info)"),
+        ("Number", "action gives (4, {}); give (action, info)"),
+        ("Stateless", "were given); define it as overcooked_ai's Agent has it"),
+        ("Fails", "fails in act (KeyError: 'key'); correct their_agents.py, line "),
+        (
+            "share_locked",
+            "cannot be made anew (TypeError: cannot pickle '_thread.lock' object); give a class, or a fun",
+        ),
+    ],
+)
+def test_answers_that_are_no_actions_are_refused_before_anything_is_played(name: str, told: str) -> None:
+    with pytest.raises(UserError) as caught:
+        open_user_agent(f"their_agents:{name}", ENV)
+    line = str(caught.value)
+    assert line.startswith(f"their_agents:{name}: ") and told in line and len(line.splitlines()) == 1
+
+
+@pytest.mark.usefixtures("module")
+def test_the_line_of_a_fault_is_the_agents_own() -> None:
+    with pytest.raises(UserError) as caught:
+        open_user_agent("their_agents:Crashes", ENV)
+    line = MODULE.splitlines().index("        return self.table[0]") + 1
+    assert caught.value.fix == f"correct their_agents.py, line {line}"
+
+
+@pytest.mark.usefixtures("module")
+def test_an_action_that_there_is_not_ends_a_game_that_began_well() -> None:
+    tires = open_user_agent("their_agents:Tires", ENV)()
+    taken = list[np.ndarray]()
+    with pytest.raises(UserError, match=r"their_agents:Tires: act gives the action 6; give a whole number from 0 to 5"):
+        play(ENV, [tires], np.zeros((2, 2), int), seed=0, record=lambda step: taken.append(step.actions.copy()))
+    assert len(taken) == 3
+
+
+def list_actions(policies: list[Policy], seats: list[list[int]]) -> np.ndarray:
+    """(T, B, P) what is played."""
+    taken = list[np.ndarray]()
+    play(ENV, policies, np.array(seats), seed=0, record=lambda step: taken.append(step.actions.copy()))
+    return np.stack(taken)
+
+
+@pytest.mark.usefixtures("module")
+def test_lists_of_whole_numbers_are_actions() -> None:
+    assert (list_actions([open_user_agent("their_agents:Lists", ENV)()], [[0, 0]] * 2) == [5, 4]).all()
+
+
+@pytest.mark.usefixtures("module")
+@pytest.mark.parametrize("name", ["share", "one_for_all", "network", "Counts"])
+def test_an_ego_and_a_partner_of_one_name_have_a_memory_each(name: str) -> None:
+    make = open_user_agent(f"their_agents:{name}", ENV)
+    steps = list_actions([make(), make()], [[0, 1], [1, 0]])
+    np.testing.assert_array_equal(steps, np.broadcast_to(np.arange(12)[:, None, None] % 4, (12, 2, 2)))
+
+
+@pytest.mark.usefixtures("module")
+def test_an_agent_of_overcooked_ai_that_a_function_gives_again_has_a_memory_for_each_seat() -> None:
+    steps = list_actions([open_user_agent("their_agents:share_agent", ENV)()], [[0, 0]] * 2)
+    assert (steps == [0, 1]).all()
+
+
+@pytest.mark.parametrize(("answer", "told"), [(260, "0 to 255, got 260 to 260"), (-1, "-1"), (1.7, "whole numbers")])
+def test_a_batch_of_games_takes_no_action_that_a_cast_would_change(answer: float, told: str) -> None:
+    policy = IdlePolicy(ENV.spec.action_names)
+    policy.act = lambda obs, previous_actions, is_first: np.full(obs.shape[:2], answer)  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match=told):
+        play(ENV, [policy], np.zeros((2, 2), int), seed=0)
