@@ -202,7 +202,7 @@ def _bound_proximity(clipped: np.ndarray, groups: Sequence[int]) -> Interval:
     kept = np.flatnonzero(np.isfinite(clipped).any((0, 2)))
     if not kept.size:
         return Interval(math.nan, math.nan, math.nan)
-    own = [groups[place] for place in kept]
+    own = [groups[int(place)] for place in kept]
     return bootstrap_crossed(
         clipped[:, kept], own, lambda drawn: interquartile_mean(drawn[np.isfinite(drawn)]), repetitions=REPETITIONS
     )
