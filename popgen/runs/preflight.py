@@ -212,7 +212,8 @@ def _build(config: RunConfig) -> EnvSpec:
             fix = "leave it out, or choose the environment by its group, env=NAME, which gives what it needs"
             raise UserError(f"env.params.{unknown[1]}", problem, fix) from None
         name = error.field.removeprefix("env.")
-        field = f"env.params.{name}" if name in config.env.params else "env.name" if name == "layout" else error.field
+        is_param = name in config.env.params or name == "grid"
+        field = f"env.params.{name}" if is_param else "env.name" if name == "layout" else error.field
         raise UserError(field, error.problem, error.fix) from None
 
 

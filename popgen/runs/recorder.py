@@ -203,10 +203,6 @@ class RunRecorder:
         """Open the MLflow store; needs Ray where the tracker is an actor."""
         self.mlflow.start()
 
-    def save_tracking(self) -> None:
-        """Keep the MLflow run ids: a resumed run continues in the same MLflow runs."""
-        self.mlflow.save_runs()
-
     def log_artefacts(self, report: Iterable[Path]) -> None:
         """Copy what the run leaves behind to its MLflow run: configuration, ledger, population and report.
 

@@ -54,6 +54,7 @@ def test_bad_grids_are_told_in_one_line(case):
     [
         ({"layout": "cramped_rom"}, "env.layout", "did you mean cramped_room"),
         ({"layout": "zzz"}, "env.layout", "unknown layout 'zzz'"),
+        ({"layout": "custom"}, "env.grid", "is missing: 'custom' is no layout"),
         ({"layout": "no/such.layout"}, "env.layout", "unknown layout"),
         ({"layout": "/etc/passwd"}, "env.layout", "unknown layout"),
         ({"layout": "cramped_room_single"}, "env.layout", "exactly two players"),

@@ -532,6 +532,8 @@ def test_rllib_needs_ray(root: Path) -> None:
     config = smoke(root, "inline", "method=lipo")
     spec = make_env(config.env.name, 1, **config.env.params).spec
     with pytest.raises(UserError, match="run.transport: is inline, but RLlib needs Ray"):
+        preflight(smoke(root, "inline", "method=lipo", "run.transport=inline"))
+    with pytest.raises(UserError, match="run.transport: is inline, but RLlib needs Ray"):
         open_training(config, spec, "inline.1", InlineTransport())
 
 

@@ -16,6 +16,7 @@ from popgen.errors import UserError
 
 DIRECTIONS = ((0, -1), (0, 1), (1, 0), (-1, 0))  # north, south, east, west as (dx, dy)
 MAX_CELLS = 255
+CUSTOM = "custom"  # the name of a grid that has no other
 TILES = {
     "O": "onion dispenser", "T": "tomato dispenser", "D": "dish dispenser", "P": "pot", "S": "serving location",
 }  # fmt: skip
@@ -101,7 +102,7 @@ def load_layout(layout: str, grid: str | None = None, rules: Mapping[str, Any] |
     if grid is not None:
         if not isinstance(grid, str):
             raise UserError("env.grid", f"must be text, got {type(grid).__name__}")
-        made = Layout(layout or "custom", _split_rows(grid), rule_keys(rules or {}, "env.rules"), False)
+        made = Layout(layout or CUSTOM, _split_rows(grid), rule_keys(rules or {}, "env.rules"), False)
         field = "env.grid"
     else:
         if rules:
@@ -145,6 +146,9 @@ def _from_file(layout: str) -> Layout:
                 "env.layout", "overcooked_ai is not installed", "pip install overcooked-ai, or give env.grid"
             )
         path = folder / f"{layout}.layout"
+    if layout == CUSTOM and not path.is_file():
+        fix = "give rows separated by '/', or a file by env.name=overcooked/PATH.layout"
+        raise UserError("env.grid", f"is missing: {CUSTOM!r} is no layout, but a grid of your own", fix)
     if path.suffix != ".layout" or not path.is_file():
         close = difflib.get_close_matches(path.stem, layout_names(), 3) if named else []
         fix = f"did you mean {' or '.join(close)}?" if close else "give a layout of overcooked_ai or a .layout file"

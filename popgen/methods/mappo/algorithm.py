@@ -176,16 +176,17 @@ class Mappo(PPO):
     # ---- runners -------------------------------------------------------------------------------------------------
 
     def _request_rollouts(self, what: str, counted: list[Counted], **request: Any) -> list[Rollout]:
-        """Ask every runner, and count what comes back. A lost runner's share is missing until it has been restarted."""
-        answers: list[tuple[int, Any]] = []
+        """Ask every runner, and count what comes back. A lost runner's share is missing until it has been restarted; a
+        runner may have none."""
+        rollouts: list[tuple[int, Rollout]] = []
         for _ in range(ATTEMPTS):
             answers = self._ask_runners(what, request)
-            if answers:
+            if rollouts := [(runner, answer) for runner, answer in answers if answer is not None]:
                 break
             self.restore_env_runners(self.env_runner_group)
-        if not answers:
+        if not rollouts:
             raise RayActorError(error_msg=f"no runner answered {ATTEMPTS} times")
-        rollouts = [(runner, answer) for runner, answer in answers if answer is not None]
+        self.played.add_habits([rollout for _, rollout in rollouts])
         for runner, rollout in rollouts:
             judge = what == "episodes" or not self.job.fresh
             counted += self.played.add(runner, rollout, judge_partners=judge)

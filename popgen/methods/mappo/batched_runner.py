@@ -79,8 +79,11 @@ class BatchedRunner(EnvRunner):
         active: Sequence[int] = (),
         steps: int = 0,
         **kwargs: Any,
-    ) -> Rollout:
-        """`steps` steps of this runner's environments of the matches `active`, with the learners' `weights`."""
+    ) -> Rollout | None:
+        """`steps` steps of this runner's environments of the matches `active`, with the learners' `weights`; None where
+        it has none of them."""
+        if not any(self.pool.matches[index].envs for index in active):
+            return None
         return self.pool.play(active, steps, self._load_actors(weights or {}))
 
     @never_raises

@@ -6,6 +6,7 @@
 All pairs are trained together: each with itself, and every confederate with every other's best response, in both
 seatings. Everyone learns from its own seat, in each iteration from its cross-play with all others. Divided by the
 weight of C_ii, the objective of a pair is its own return less lambda times its mean cross-play (`cross_play_weight`).
+With alpha 0, a control, pairs do not meet: no cross-play is sampled, and `ppo.target_score` alone ends the training.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.mappo.config import BrdivRun, DiversityConfig
 from popgen.methods.mappo.needs import list_pair_roles
 from popgen.methods.mappo.objective import Objective
-from popgen.methods.mappo.train import STEP_SECONDS, RllibTraining, refuse_inline
+from popgen.methods.mappo.train import STEP_SECONDS, RllibTraining, check_transport
 from popgen.methods.mappo.training_job import Job
 from popgen.methods.training import PlannedPhase, TrainedMember, Transport
 from popgen.types import CONFEDERATE_ROLE
@@ -52,7 +53,7 @@ class BrdivTraining(RllibTraining):
         return Job(
             env=config.env,
             ppo=config.ppo,
-            diversity=diversity,
+            diversity=diversity if brdiv.alpha > 0.0 else None,
             learning=(*pairs, *pairs.values()),
             seed=config.run.seed * 1000 + 1,
             pairs=pairs,
@@ -78,7 +79,7 @@ class BrdivTraining(RllibTraining):
 
     def plan(self) -> list[PlannedPhase]:
         """One phase, of all pairs."""
-        met = (self.count - 1) * self.brdiv.xp_envs / self.config.ppo.envs
+        met = (self.count - 1) * self.brdiv.xp_envs / self.config.ppo.envs if self.brdiv.alpha > 0.0 else 0.0
         cost = self.count * (1.0 + met) * self.config.ppo.max_steps * STEP_SECONDS
         return [PlannedPhase(self.config.method, 1, cost, self.config.population.size, earliest=0.0)]
 
@@ -93,5 +94,5 @@ class BrdivTraining(RllibTraining):
 
 def open_training(config: BrdivRun, spec: EnvSpec, attempt: str, transport: Transport) -> BrdivTraining:
     """See `popgen.methods.training.OpenTraining`."""
-    refuse_inline(transport)
+    check_transport(transport)
     return BrdivTraining(config, spec, attempt)

@@ -137,7 +137,7 @@ class MepConfig(Schema):
 
     alpha: Weight = 0.01
     """Reward for each nat of surprise and seat, where the training reward of a dish is 18 or more (the paper's alpha);
-    0 is MAPPO."""
+    0 is MAPPO, but several members have other first weights than its."""
     floor: Rate = 1e-5
     """Least probability that counts: it bounds what one step can earn."""
 
@@ -155,7 +155,8 @@ class TrajediConfig(Schema):
     """The trajectory divergence of TrajeDi (Lupu et al. 2021)."""
 
     alpha: Weight = 0.1
-    """Reward for each nat of divergence of a step, as of the action that makes it (the paper's alpha); 0 is MAPPO."""
+    """Reward for each nat of divergence of a step, as of the action that makes it (the paper's alpha); 0 is MAPPO, but
+    several members have other first weights than its."""
     full_score: Annotated[Weight, AddedLater] = 0.0
     """Mean self-play score at which alpha has its full weight; it rises with a member's score in a straight line from
     0; 0: full weight from the beginning."""
@@ -202,7 +203,8 @@ class HspConfig(Schema):
     are their best responses (ZSC-Eval)."""
     spread: Weight = 10.0
     """Largest weight of an event, either sign, where a dish is worth 18 or more; a fiftieth of it for events that can
-    happen at every step. 0 leaves the true reward: one policy in both seats, which is MAPPO."""
+    happen at every step. 0 leaves the true reward: one policy in both seats, which is MAPPO, but several
+    pairs have other first weights than its members."""
     biases: Positive = 3
     """Events with a weight in each biased agent's utility, drawn from HSP's list."""
     reward: Weight = 1.0
@@ -235,7 +237,7 @@ class BrdivConfig(Schema):
 
     alpha: Weight = 1.0
     """Weight of every difference between a pair's own return and its cross-play with another pair (eq. BRDiv); 0 leaves
-    the pairs' own returns."""
+    the pairs' own returns: no cross-play is sampled."""
     members: Literal["both", "confederates"] = "both"
     """Who of a pair becomes a member; `both`: the confederate, then its best response, two members a pair."""
     warmup: NonNegative = 10

@@ -3,9 +3,10 @@
     J(j) = J_SP(j)
 
 Each seed gives three members: the policy it started from, one on its way whose self-play is nearest to half of the
-final one's, and the final one. A policy on the way has the score of the iteration that it played, and of no other; the
-final one, which has played none yet, that of the latest `ppo.window` episodes before it, as every method's members.
-All of a seed's environment steps and seconds are counted for its final member.
+final one's (half way from the initial one's where that is negative), and the final one. A policy on the way has the
+score of the iteration that it played, and of no other; the final one, which has played none yet, that of the latest
+`ppo.window` episodes before it, as every method's members. All of a seed's environment steps and seconds are counted
+for its final member.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.methods.mappo.config import FcpRun
 from popgen.methods.mappo.objective import SELF_PLAY
 from popgen.methods.mappo.play_record import rate_self_play
-from popgen.methods.mappo.train import RllibTraining, refuse_inline
+from popgen.methods.mappo.train import RllibTraining, check_transport
 from popgen.methods.mappo.training_job import policy_config
 from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
 from popgen.methods.training import Checkpoint, Loop, PlannedPhase, State, TrainedMember, Transport
@@ -65,17 +66,12 @@ class FcpTraining(RllibTraining):
     def finish_members(self) -> Iterator[TrainedMember]:
         """The three of this seed."""
         final = self.finish_member(self.learning[0])
-        reached = float(final.extra.get("sp", 0.0))
-        chosen = (self.skills.kept[0], self.skills.nearest(reached / 2.0))
-        for number, (skill, checkpoint) in enumerate(zip(SKILLS, chosen, strict=False)):
-            member = final.member - len(SKILLS) + 1 + number
-            extra = {"skill": skill, "of_member": final.member, **checkpoint.figures()}
-            policy = FeedForwardPolicy.from_parts(policy_config(self.config.ppo), checkpoint.actor, self.spec)
-            self.archive[member] = policy.weights()
-            note = f"member {member}: {skill} of member {final.member}, {checkpoint.steps:,} steps into its training"
-            yield TrainedMember(member, policy, None, seed=final.seed, extra=extra, left=final.left, note=note)
-        final.extra["skill"] = SKILLS[-1]
-        yield final
+        for member in self.skills.finish_seed(final, self._make_policy):
+            self.archive[member.member] = member.policy.weights()
+            yield member
+
+    def _make_policy(self, actor: Weights) -> FeedForwardPolicy:
+        return FeedForwardPolicy.from_parts(policy_config(self.config.ppo), actor, self.spec)
 
     def checkpoint(self) -> State:
         """See `Training`."""
@@ -90,5 +86,5 @@ class FcpTraining(RllibTraining):
 
 def open_training(config: FcpRun, spec: EnvSpec, attempt: str, transport: Transport) -> FcpTraining:
     """See `popgen.methods.training.OpenTraining`."""
-    refuse_inline(transport)
+    check_transport(transport)
     return FcpTraining(config, spec, attempt)

@@ -27,10 +27,10 @@ from popgen.envs.contract import EnvSpec
 from popgen.envs.player_events import BR_DIV_EVENTS, SPARSE_REWARD, name_player_events
 from popgen.methods.mappo.config import BpRun, HspConfig, HspRun
 from popgen.methods.mappo.hidden_utility import draw_utility
-from popgen.methods.mappo.needs import roles_of
+from popgen.methods.mappo.needs import list_pair_roles
 from popgen.methods.mappo.objective import Objective
 from popgen.methods.mappo.play_record import Counted
-from popgen.methods.mappo.train import STEP_SECONDS, RllibTraining, refuse_inline
+from popgen.methods.mappo.train import STEP_SECONDS, RllibTraining, check_transport
 from popgen.methods.mappo.training_job import Job
 from popgen.methods.training import Checkpoint, PlannedPhase, Progress, Record, State, Transport
 from popgen.play.event_diversity import choose_most_distant, choose_most_diverse
@@ -45,7 +45,7 @@ class HspTraining(RllibTraining):
         super().__init__(config, spec, attempt, Objective(together=True))
         self.hsp: HspConfig = config.hsp
         self.names = name_player_events(make_env(config.env.name, 1, **config.env.params))
-        self.roles = roles_of(config.hsp)
+        self.roles = list_pair_roles(config.hsp)
         self.utilities = {
             pair: draw_utility(
                 self.names,
@@ -207,5 +207,5 @@ def _mean_figures(rows: list[dict[str, float]]) -> dict[str, float]:
 
 def open_training(config: HspRun | BpRun, spec: EnvSpec, attempt: str, transport: Transport) -> HspTraining:
     """See `popgen.methods.training.OpenTraining`."""
-    refuse_inline(transport)
+    check_transport(transport)
     return HspTraining(config, spec, attempt)

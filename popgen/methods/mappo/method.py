@@ -18,7 +18,7 @@ from popgen.methods.mappo.needs import (
     check_e3t,
     check_fcp,
     check_hsp,
-    check_view,
+    check_run,
     estimate_brdiv,
     estimate_comedi,
     estimate_hsp,
@@ -53,7 +53,7 @@ MAPPO = Method(
     training="popgen.methods.mappo.train:open_training",
     actors=list_actors,
     needs=estimate_mappo,
-    check=check_view,
+    check=check_run,
 )
 
 LIPO = Method(
@@ -68,7 +68,7 @@ LIPO = Method(
     objectives=LIPO_OBJECTIVES,
     actors=list_actors,
     needs=estimate_lipo,
-    check=check_view,
+    check=check_run,
 )
 
 COMEDI = Method(
@@ -112,7 +112,7 @@ MEP = Method(
     training="popgen.methods.mappo.mep:open_training",
     actors=list_actors,
     needs=estimate_together,
-    check=check_view,
+    check=check_run,
 )
 
 TRAJEDI = Method(
@@ -126,7 +126,7 @@ TRAJEDI = Method(
     training="popgen.methods.mappo.trajedi:open_training",
     actors=list_actors,
     needs=estimate_together,
-    check=check_view,
+    check=check_run,
 )
 
 HSP = Method(

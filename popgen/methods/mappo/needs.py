@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NoReturn
 
 import numpy as np
 
@@ -60,9 +61,10 @@ def estimate_comedi(config: ComediRun, spec: EnvSpec) -> Needs:
     return _estimate(config, spec, critics=1 + 2 * partners, environments=environments, fresh=fresh)
 
 
-def roles_of(hsp: HspConfig) -> tuple[str, ...]:
-    """Of the members that a chosen pair gives, in order."""
-    return {"both": (BIASED_ROLE, PARTNER_ROLE), "biased": (BIASED_ROLE,), "partners": (PARTNER_ROLE,)}[hsp.members]
+def list_pair_roles(pairs: HspConfig | BrdivConfig) -> tuple[str, ...]:
+    """Of the members that a pair gives, in order."""
+    first = BIASED_ROLE if isinstance(pairs, HspConfig) else CONFEDERATE_ROLE
+    return {"both": (first, PARTNER_ROLE), "partners": (PARTNER_ROLE,)}.get(pairs.members, (first,))
 
 
 def estimate_hsp(config: HspRun | BpRun, spec: EnvSpec) -> Needs:
@@ -72,47 +74,50 @@ def estimate_hsp(config: HspRun | BpRun, spec: EnvSpec) -> Needs:
 
 
 def check_hsp(config: HspRun | BpRun, spec: EnvSpec) -> None:
-    """The view, whole pairs, and a pool that has as many.
+    """A run of RLlib's, whole pairs, and a pool that has as many.
 
     Raises:
-        UserError: a view that the environment does not have, half a pair, or more pairs than are trained.
+        UserError: what `check_run` refuses, half a pair, or more pairs than are trained.
     """
-    check_view(config, spec)
-    size, each = config.population.size, len(roles_of(config.hsp))
-    if size % each:
-        problem = f"{size} is no multiple of {each}: each pair gives a biased agent and its partner"
-        raise UserError("population.size", problem, f"set it to {size + 1}")
+    check_run(config, spec)
+    size, each = config.population.size, len(list_pair_roles(config.hsp))
+    _check_groups(size, each, "each pair gives a biased agent and its partner")
     if size // each > config.hsp.pool:
         raise UserError("hsp.pool", f"is {config.hsp.pool}, of which {size // each} are to be chosen", "raise it")
-    if config.ppo.envs < 2:
-        raise UserError("ppo.envs", "a pair plays in two seatings", "set it to at least 2")
-
-
-def list_pair_roles(brdiv: BrdivConfig) -> tuple[str, ...]:
-    """Of the members that a pair of BRDiv gives, in order."""
-    return (CONFEDERATE_ROLE, PARTNER_ROLE) if brdiv.members == "both" else (CONFEDERATE_ROLE,)
+    _check_seatings(config)
 
 
 def estimate_brdiv(config: BrdivRun, spec: EnvSpec) -> Needs:
     """Bytes of all pairs at once, two policies each, and of their cross-play."""
     pairs = config.population.size // len(list_pair_roles(config.brdiv))
-    environments = pairs * config.ppo.envs + pairs * (pairs - 1) * config.brdiv.xp_envs
-    return _estimate(config, spec, critics=pairs, environments=environments, together=2 * pairs)
+    crossed = pairs - 1 if config.brdiv.alpha > 0.0 else 0
+    environments = pairs * (config.ppo.envs + crossed * config.brdiv.xp_envs)
+    return _estimate(config, spec, critics=1 + crossed, environments=environments, together=2 * pairs)
 
 
 def check_brdiv(config: BrdivRun, spec: EnvSpec) -> None:
-    """The view, and at least two whole pairs.
+    """A run of RLlib's, and at least two whole pairs.
 
     Raises:
-        UserError: a view that the environment does not have, half a pair, or a single one.
+        UserError: what `check_run` refuses, half a pair, or a single one.
     """
-    check_view(config, spec)
+    check_run(config, spec)
     size, each = config.population.size, len(list_pair_roles(config.brdiv))
-    if size % each:
-        problem = f"{size} is no multiple of {each}: each pair gives a confederate and its best response"
-        raise UserError("population.size", problem, f"set it to {size + 1}")
+    _check_groups(size, each, "each pair gives a confederate and its best response")
     if size < 2 * each:
         raise UserError("population.size", f"{size} leaves a pair nobody to differ from", f"set it to {2 * each}")
+    _check_seatings(config)
+
+
+def _check_groups(size: int, each: int, gives: str) -> None:
+    """A population of whole groups of members that come together."""
+    if left := size % each:
+        problem = f"{size} is no multiple of {each}: {gives}"
+        raise UserError("population.size", problem, f"set it to {size + each - left}")
+
+
+def _check_seatings(config: BaselineRun) -> None:
+    """Environments for both seatings of a pair."""
     if config.ppo.envs < 2:
         raise UserError("ppo.envs", "a pair plays in two seatings", "set it to at least 2")
 
@@ -145,47 +150,56 @@ def _build_networks(ppo: PpoConfig, spec: EnvSpec, critics: int) -> list[object]
     return [FeedForwardNet(view, spec.num_actions, players, sizes), *values]
 
 
-def check_view(config: BaselineRun, spec: EnvSpec) -> None:
-    """The environment must have the networks' view.
+def refuse_inline() -> NoReturn:
+    """RLlib starts its own workers, on Ray.
 
     Raises:
-        UserError: it does not.
+        UserError: always.
     """
+    raise UserError("run.transport", "is inline, but RLlib needs Ray", "set run.transport=ray")
+
+
+def check_run(config: BaselineRun, spec: EnvSpec) -> None:
+    """RLlib needs Ray, and the environment must have the networks' view.
+
+    Raises:
+        UserError: everything is to be in one process, or the environment does not have the view.
+    """
+    if config.run.transport == "inline":
+        refuse_inline()
     view = config.ppo.view
     if view not in spec.views:
         raise UserError("ppo.view", f"{spec.name} has no view {view!r}", f"choose one of {', '.join(spec.views)}")
 
 
 def check_comedi(config: ComediRun, spec: EnvSpec) -> None:
-    """The view, and one member after the other.
+    """A run of RLlib's, and one member after the other.
 
     Raises:
-        UserError: a view that the environment does not have, or another order.
+        UserError: what `check_run` refuses, or another order.
     """
-    check_view(config, spec)
+    check_run(config, spec)
     if config.diversity.order != "sequential":
         raise UserError("diversity.order", "CoMeDi trains one member after the other", "set it to sequential")
 
 
 def check_e3t(config: E3tRun, spec: EnvSpec) -> None:
-    """The view, and an environment for each seating and for plain self-play.
+    """A run of RLlib's, and an environment for each seating and for plain self-play.
 
     Raises:
-        UserError: a view that the environment does not have, or too few environments.
+        UserError: what `check_run` refuses, or too few environments.
     """
-    check_view(config, spec)
+    check_run(config, spec)
     if config.e3t.epsilon > 0.0 and config.ppo.envs < 3:
         raise UserError("ppo.envs", "E3T plays in two seatings, and plainly with itself", "set it to at least 3")
 
 
 def check_fcp(config: FcpRun, spec: EnvSpec) -> None:
-    """The view, and whole seeds.
+    """A run of RLlib's, and whole seeds.
 
     Raises:
-        UserError: a view that the environment does not have, or members that are no whole seeds.
+        UserError: what `check_run` refuses, or members that are no whole seeds.
     """
-    check_view(config, spec)
-    size, each = config.population.size, len(SKILLS)
-    if size % each:
-        problem = f"{size} is no multiple of {each}: each seed gives an initial, a half trained and a final member"
-        raise UserError("population.size", problem, f"set it to {size + each - size % each}")
+    check_run(config, spec)
+    gives = "each seed gives an initial, a half trained and a final member"
+    _check_groups(config.population.size, len(SKILLS), gives)

@@ -157,7 +157,6 @@ class PlayRecord:
             total.covered += float(rollout.covered[:, columns].sum(dtype=np.float64))
             if match.kind is Kind.SP:
                 self.taken[match.owner] += played
-        self._add_habits(rollout)
         for episode in rollout.episodes:
             total = totals[episode.owner, episode.kind]
             total.episodes += 1
@@ -170,15 +169,14 @@ class PlayRecord:
                     self.partners[member].add(episode.partner_of(member), [episode.shaped], [episode.score])
         return [Counted(runner, owner, kind, **vars(total)) for (owner, kind), total in totals.items()]
 
-    def _add_habits(self, rollout: Rollout) -> None:
-        """A tenth of the moving mean is what each player did in these steps."""
-        if not rollout.events.shape[-1]:
-            return
+    def add_habits(self, rollouts: Sequence[Rollout]) -> None:
+        """A tenth of the moving mean is what each player did in an iteration: in these steps of all runners."""
+        counted = [rollout for rollout in rollouts if rollout.events.shape[-1]]
         for member in self.job.learning:
-            own = rollout.seats == member
-            if not own.any():
+            parts = [rollout.events[rollout.seats == member] for rollout in counted]
+            if not (steps := sum(map(len, parts))):
                 continue
-            now = rollout.events[own].mean(0, dtype=np.float64)
+            now = np.sum([part.sum(0, dtype=np.float64) for part in parts], 0) / steps
             before = self.habits[member] if member in self.habits else now  # noqa: SIM401 (a type that is known)
             self.habits[member] = before * HABIT_DECAY + (1.0 - HABIT_DECAY) * now
 

@@ -22,6 +22,7 @@ from popgen.envs.contract import EnvSpec
 from popgen.errors import UserError
 from popgen.methods.mappo.algorithm import Mappo, build_algorithm
 from popgen.methods.mappo.config import BaselineRun, DiversityConfig, PartnerRun
+from popgen.methods.mappo.needs import refuse_inline
 from popgen.methods.mappo.objective import SELF_PLAY, Objective
 from popgen.methods.mappo.play_record import Counted
 from popgen.methods.mappo.training_job import Job, policy_config
@@ -314,18 +315,18 @@ def open_rllib(
     Raises:
         UserError: everything is to be in this process, which RLlib cannot do without Ray.
     """
-    refuse_inline(transport)
+    check_transport(transport)
     return RllibTraining(config, spec, attempt, objective)
 
 
-def refuse_inline(transport: Transport) -> None:
+def check_transport(transport: Transport) -> None:
     """RLlib starts its own workers.
 
     Raises:
         UserError: everything is to be in this process.
     """
     if isinstance(transport, InlineTransport):
-        raise UserError("run.transport", "is inline, but RLlib needs Ray", "set run.transport=ray")
+        refuse_inline()
 
 
 def open_training(config: BaselineRun, spec: EnvSpec, attempt: str, transport: Transport) -> RllibTraining:

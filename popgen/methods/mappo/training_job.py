@@ -28,7 +28,7 @@ class Job:
         learning: members to train.
         frozen: member -> weights of its actor.
         mixed: with mixed play (CoMeDi).
-        fresh: the strongest partner is matches by episodes of its own (CoMeDi), not by the training's.
+        fresh: the strongest partner is found by episodes of its own (CoMeDi), not by the training's.
         seed: of everything.
         bonus: added to self-play's reward.
         bonus_score: mean self-play score at which it is paid in full; in proportion below. 0: always in full.

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints
+from popgen.methods.skill_checkpoints import SkillCheckpoint, SkillCheckpoints, mark_final
 from popgen.methods.training import PlannedPhase, TrainedMember
 from popgen.methods.xpm_wm.actor_critic import WorldModelPolicy
 from popgen.methods.xpm_wm.member_training import XpmWmTraining
 from popgen.methods.xpm_wm.phase2 import LaterMemberProgress
 from popgen.methods.xpm_wm.train import FIRST
-from popgen.types import SKILLS
+from popgen.types import SKILLS, Weights
 
 
 class FcpWmTraining(XpmWmTraining):
@@ -44,21 +44,14 @@ class FcpWmTraining(XpmWmTraining):
         return tuple(range(first, final + 1))
 
     def finish_members(self, final: TrainedMember) -> Iterator[TrainedMember]:
-        """The three of this seed."""
-        if final.member != FIRST:
-            yield from self._finish_unskilled(final)
-        final.extra["skill"] = SKILLS[-1]
-        yield final
-
-    def _finish_unskilled(self, final: TrainedMember) -> Iterator[TrainedMember]:
-        """Those before the final one; they leave behind what it does, so that any may be the last of a population."""
+        """The three of this seed; member 1 is its final one alone."""
+        if final.member == FIRST:
+            yield mark_final(final)
+            return
         assert isinstance(self.progress, LaterMemberProgress) and self.progress.skills is not None
-        kept = self.progress.skills
-        chosen = (kept.kept[0], kept.nearest(float(final.extra["sp"]) / 2.0))
-        for number, (skill, checkpoint) in enumerate(zip(SKILLS, chosen, strict=False)):
-            member = final.member - len(SKILLS) + 1 + number
-            policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
-            policy.load(checkpoint.actor)
-            extra = {"skill": skill, "of_member": final.member, **checkpoint.figures()}
-            note = f"member {member}: {skill} of member {final.member}, {checkpoint.steps:,} steps into its training"
-            yield TrainedMember(member, policy, None, seed=final.seed, extra=extra, left=final.left, note=note)
+        yield from self.progress.skills.finish_seed(final, self._make_policy)
+
+    def _make_policy(self, actor: Weights) -> WorldModelPolicy:
+        policy = WorldModelPolicy(self.config.world_model, self.config.agent, self.spec)
+        policy.load(actor)
+        return policy

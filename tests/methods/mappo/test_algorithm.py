@@ -13,10 +13,12 @@ import pytest
 import ray
 from ray.train.constants import DEFAULT_STORAGE_PATH
 
+from popgen.config.run_config import RunConfig
 from popgen.config.sections import ClusterConfig, EnvConfig
 from popgen.envs import make_env
 from popgen.methods.mappo import algorithm as module
 from popgen.methods.mappo.algorithm import Mappo, MappoConfig
+from popgen.methods.mappo.brdiv import BrdivTraining
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.methods.mappo.play_record import PlayRecord
 from popgen.methods.mappo.pooling import Plan
@@ -68,6 +70,22 @@ def test_rllib_takes_the_largest_seed_of_a_run_and_small_ones_as_they_are(solo: 
     large.train()
     assert totals(large) == {(1, "SP"): 40}
     large.stop()
+
+
+def test_brdiv_without_weight_has_the_ledger_of_pairs_alone() -> None:
+    sections = {"population": {"size": 4}, "ppo": PPO.model_dump(), "brdiv": {"alpha": 0.0}, "run": {"seed": 3}}
+    config: Any = RunConfig.parse({"method": "brdiv", "env": ENV.model_dump(), **sections})
+    brdiv = BrdivTraining(config, SPEC, "test.1").make_job()
+    pairs = Job(ENV, PPO, None, (1, 2, 3, 4), seed=3001, pairs={1: 3, 2: 4})
+    counted = []
+    for job in (brdiv, pairs):
+        algorithm = build(job)
+        for _ in range(3):
+            algorithm.train()
+        counted.append(algorithm.report.counted)
+        assert totals(algorithm) == {(1, "SP"): 40, (2, "SP"): 40}
+        algorithm.stop()
+    assert counted[0] == counted[1] and sum(one.episodes for one in counted[0])
 
 
 def totals(algorithm: Mappo) -> dict[tuple[int, str], int]:

@@ -47,9 +47,12 @@ def test_cross_plays_weight_is_that_of_the_objective(alpha: float, pairs: int) -
     assert cross_play_weight(alpha, pairs) == pytest.approx(-worth[1] / worth[0], abs=1e-6)
 
 
+def config_of(size: int, **brdiv: Any) -> Any:
+    return RunConfig.parse({"method": "brdiv", "population": {"size": size}, "brdiv": brdiv})
+
+
 def make_training(members: str, size: int, **brdiv: Any) -> BrdivTraining:
-    config = RunConfig.parse({"method": "brdiv", "population": {"size": size}, "brdiv": {"members": members, **brdiv}})
-    training = BrdivTraining(config, SPEC, "test.1")  # type: ignore[arg-type]
+    training = BrdivTraining(config_of(size, members=members, **brdiv), SPEC, "test.1")
     training.learning = tuple(range(1, size + 1))
     return training
 
@@ -98,16 +101,29 @@ def test_without_weight_a_pair_learns_from_its_own_play_alone() -> None:
     assert plan.sources(1) == [(Kind.SP, 4, 1.0)]
 
 
-def test_half_pairs_and_single_ones_are_refused() -> None:
-    def run(size: int, **brdiv: Any) -> Any:
-        return RunConfig.parse({"method": "brdiv", "population": {"size": size}, "brdiv": brdiv})
+def test_without_weight_pairs_do_not_meet_and_end_at_their_target() -> None:
+    training = make_training("both", 4, alpha=0.0)
+    job = training.make_job()
+    matches = [(match.kind, match.members, match.envs) for match in job.matches()]
+    assert matches == [(Kind.SP, pair, 32) for pair in ((1, 3), (3, 1), (2, 4), (4, 2))]
+    assert [job.critics(member) for member in job.learning] == [["SP"]] * 4
+    assert training.plan()[0].cost < make_training("both", 4).plan()[0].cost
+    record = PlayRecord(job)
+    for pair in (1, 2):
+        assert not record.finished
+        record.own[pair].extend([job.ppo.target_score] * job.ppo.window)
+    assert record.finished
+    crossed, alone = (estimate_brdiv(config_of(4, alpha=alpha), SPEC) for alpha in (1.0, 0.0))
+    assert alone.batch * 3 == crossed.batch * 2 and alone.member < crossed.member
 
+
+def test_half_pairs_and_single_ones_are_refused() -> None:
     with pytest.raises(UserError, match=r"population.size: 5 is no multiple of 2.*set it to 6"):
-        check_brdiv(run(5), SPEC)
+        check_brdiv(config_of(5), SPEC)
     with pytest.raises(UserError, match=r"population.size: 2 leaves a pair nobody"):
-        check_brdiv(run(2), SPEC)
-    check_brdiv(run(3, members="confederates"), SPEC)
-    assert estimate_brdiv(run(8), SPEC).together == 8
+        check_brdiv(config_of(2), SPEC)
+    check_brdiv(config_of(3, members="confederates"), SPEC)
+    assert estimate_brdiv(config_of(8), SPEC).together == 8
 
 
 def test_pairs_meet_across_in_both_seatings() -> None:

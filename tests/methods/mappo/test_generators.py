@@ -89,6 +89,20 @@ def test_of_two_equally_near_the_earlier_is_the_half_trained_and_the_first_is_no
     assert kept.nearest(5.0).steps == 5
 
 
+@pytest.mark.parametrize(
+    ("first", "final", "steps"),
+    [
+        (0.0, 8.0, 2),  # nearest to 4
+        (1.0, 8.0, 2),  # dishes by chance are no reason to go further
+        (-60.0, -20.0, 5),  # nearest to -40; half of -20 would be the last one
+    ],
+)
+def test_half_trained_is_half_way_of_scores_above_and_below_zero(first: float, final: float, steps: int) -> None:
+    scores = {1: -55.0, 5: -42.0, 9: -21.0} if final < 0 else {1: 1.5, 2: 3.9, 3: 4.5}
+    kept = [SkillCheckpoint(step, score, {}) for step, score in {0: first, **scores}.items()]
+    assert SkillCheckpoints(kept).half_trained(final).steps == steps
+
+
 def test_fcp_wants_whole_seeds() -> None:
     spec = make_env("overcooked/cramped_room", 1).spec
     config = RunConfig.parse({"method": "fcp", "population": {"size": 4}})

@@ -121,13 +121,32 @@ def test_events_are_counted_while_playing_and_averaged_over_iterations() -> None
         result = env.step(first.actions[t])
         assert (first.events[t] == count_player_events(env, states, first.actions[t], result)).all()
     record = PlayRecord(pair_job())
-    record.add(0, first, judge_partners=False)
-    record.add(0, second, judge_partners=False)
+    record.add_habits([first])
+    record.add_habits([second])
     before, now = (one.events[one.seats == 3].mean(0) for one in (first, second))
     np.testing.assert_allclose(record.habits[3], HABIT_DECAY * before + (1 - HABIT_DECAY) * now)
     again = PlayRecord(pair_job())
     again.load_state(record.state())
     np.testing.assert_array_equal(again.habits[1], record.habits[1])
+
+
+def test_habits_are_those_of_an_iteration_however_many_runners_play_it() -> None:
+    """Two iterations, by one runner and by two with two and one of the three environments."""
+    rng = np.random.default_rng(3)
+    whole, divided = PlayRecord(pair_job()), PlayRecord(pair_job())
+    for _ in range(2):
+        events = rng.integers(0, 2, (10, 3, 2, 2)).astype(np.uint8)
+        whole.add_habits([rollout(10, Match(Kind.SP, (1, 3), 3, 1), events=events)])
+        parts = [
+            rollout(10, Match(Kind.SP, (1, 3), count, 1), events=part)
+            for count, part in ((2, events[:, :2]), (1, events[:, 2:]))
+        ]
+        divided.add_habits(parts)
+    assert whole.habits.keys() == {1, 3}
+    assert all((whole.habits[member] == divided.habits[member]).all() for member in (1, 3))
+    assert (whole.habits[3] == whole.habits[3].clip(0.3, 0.7)).all()
+    whole.add_habits([rollout(10, Match(Kind.SP, (1, 3), 3, 1), events=np.zeros_like(events))])
+    np.testing.assert_allclose(whole.habits[3], HABIT_DECAY * divided.habits[3])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])

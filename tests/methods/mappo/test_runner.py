@@ -9,7 +9,7 @@ import pytest
 from popgen.config.sections import ClusterConfig, EnvConfig
 from popgen.envs import make_env
 from popgen.methods.mappo.algorithm import MappoConfig
-from popgen.methods.mappo.batched_runner import BatchedRunner
+from popgen.methods.mappo.batched_runner import BatchedRunner, Failure
 from popgen.methods.mappo.config import DiversityConfig, PpoConfig
 from popgen.methods.mappo.rl_module import module_spec
 from popgen.methods.mappo.slots import Rollout
@@ -73,6 +73,21 @@ def test_runners_draw_differently_and_the_same_again() -> None:
     assert (one.actions == again.actions).all() and (one.actions != other.actions).any()
     later = fresh(1, 2, 20, seed=4)
     assert later is not None and (one.actions != later.actions).any()
+
+
+@pytest.mark.parametrize("mate", [-1, 2], ids=["e3t", "pair"])
+def test_a_runner_without_environments_of_its_own_plays_nothing(mate: int) -> None:
+    learning = (1,) if mate < 0 else (1, 2)
+    small = Job(ENV, PPO, None, learning, seed=0, pairs={1: mate}, noise=0.25 if mate < 0 else 0.0)
+    config, active = MappoConfig.of(small, SPEC, ClusterConfig()), range(len(small.matches()))
+    weights = {member: actor(member) for member in learning}
+    runners = [BatchedRunner(config=config, worker_index=part, num_workers=8) for part in range(1, 9)]
+    played = [one.sample(weights=weights, active=active, steps=10) for one in runners]
+    assert [one for one in played if one is not None and not isinstance(one, Rollout)] == []
+    assert None in played and sum(one.steps for one in played if one is not None) == 10 * PPO.envs
+    idle = runners[played.index(None)]
+    assert not isinstance(saved := idle.snapshot(), Failure)
+    assert idle.restore(state=saved) is None
 
 
 def test_beside_remote_runners_the_local_one_has_nothing_to_step() -> None:

@@ -157,6 +157,13 @@ def test_a_batch_does_not_grow_with_the_number_of_partners() -> None:
     assert steps[0] == steps[1] == SMALL.unroll * 12
 
 
+def test_without_a_bound_gradients_are_as_they_are() -> None:
+    free, wide = learner(grad_clip=0.0), learner(grad_clip=1e9)
+    before = free.actor.weights()
+    assert free.update() == wide.update()
+    assert same(free.actor.weights(), wide.actor.weights()) and not same(free.actor.weights(), before)
+
+
 def test_no_weight_no_restarted_trajectories() -> None:
     made = learner(restart_weight=0.0)
     assert made.batch_columns(1).restart == 0

@@ -4,8 +4,9 @@ import pytest
 import torch
 from support.small import AGENT, MODEL, PRIVATE, random_latent, with_other_group
 
-from popgen.methods.xpm_wm.actor_critic import Actor, Critic
+from popgen.methods.xpm_wm.actor_critic import SELF, Actor, AgentNetworks, Critic
 from popgen.methods.xpm_wm.latent_filter import Latent
+from popgen.nets.weights import weights_of
 
 ACTIONS = 6
 CONFIG = AGENT.model_copy(update={"unimix": 0.06})
@@ -40,6 +41,21 @@ def test_actor_input_decides_whether_h_is_seen(actor_input: str, sees: bool) -> 
     actor, latent, seats = make_actor(actor_input=actor_input), random_latent(20), torch.zeros(20, dtype=torch.long)
     other = Latent(latent.h + 1.0, latent.z)
     assert torch.equal(actor.log_probs(latent, seats), actor.log_probs(other, seats)) != sees
+
+
+def test_without_a_bound_gradients_are_as_they_are() -> None:
+    latent, seats = random_latent(20), torch.zeros(20, dtype=torch.long)
+    left = []
+    for bound in (0.0, 1e9, 1e-9):
+        config = CONFIG.model_copy(update={"grad_clip": bound, "adam_eps": 1e-3})
+        networks = AgentNetworks(config, MODEL, ACTIONS, (), 0, torch.device("cpu"), torch.float32)
+        before = weights_of(networks.actor) | weights_of(networks.critics)
+        networks.step_actor(networks.actor.log_probs(latent, seats)[:, 0].mean())
+        networks.step_critics(networks.critic(SELF).logits(latent, seats)[:, 0].mean())
+        after = weights_of(networks.actor) | weights_of(networks.critics)
+        left.append((after, max(abs(after[name] - before[name]).max() for name in after)))
+    assert all((left[0][0][name] == left[1][0][name]).all() for name in left[0][0])
+    assert left[0][1] > 100 * left[2][1]
 
 
 def test_no_action_dies_and_a_fresh_actor_is_nearly_uniform() -> None:

@@ -54,6 +54,16 @@ def test_updates_lower_every_part_of_the_loss(config: WorldModelConfig) -> None:
         assert last[name] < share * first[name], name
 
 
+def test_without_a_bound_the_gradient_is_as_it_is() -> None:
+    free, wide = make_learner(grad_clip=0.0), make_learner(grad_clip=1e9)
+    before = w.weights_of(free.model)
+    for learner in (free, wide):
+        learner.update(random_windows(6, 5))
+    after, same = w.weights_of(free.model), w.weights_of(wide.model)
+    assert all((after[name] == same[name]).all() for name in after)
+    assert any((after[name] != before[name]).any() for name in after)
+
+
 def test_losses_and_weights_have_the_same_names() -> None:
     learner = make_learner(event_scale=7.0, continue_scale=0.3, kl_predecessors=0.2)
     terms, _, _ = learner.losses(WindowBatch.from_windows(random_windows(6, 5), learner.model))
