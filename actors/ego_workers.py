@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,8 @@ from popgen.methods.ego.train import EgoTraining
 from popgen.methods.ego.workers import Iterations
 from popgen.methods.training import Pending, Place, State, Transport, UpdateFigures
 from popgen.play.policy import Policy
-from popgen.population import Population, check_compatible, load_population
+from popgen.population import Population, check_compatible
+from popgen.population.chosen_members import load_members
 from popgen.population.store import MANIFEST
 from popgen.types import Weights
 
@@ -47,18 +47,11 @@ def read_partner(text: str) -> NamedMembers:
     Raises:
         UserError: no population, or no such member.
     """
-    path, _, numbers = text.rpartition(":")
-    if not path or not re.fullmatch(r"[0-9,]*[0-9][0-9,]*", numbers):
-        path, numbers = text, ""
-    population = load_population(path)
-    everyone = range(1, len(population) + 1)
-    members = tuple(int(number) for number in numbers.split(",") if number) or list_distinct(population)
-    if wrong := [member for member in members if member not in everyone]:
-        raise UserError("ego.partners", f"{path} has no member {wrong[0]}", f"it has {len(population)}")
+    chosen = load_members(text, "ego.partners")
+    population = chosen.population
+    members = chosen.members if chosen.named else list_distinct(population)
     if not members:
-        raise UserError("ego.partners", f"{path} has no members", "choose another population")
-    if len(set(members)) < len(members):
-        raise UserError("ego.partners", f"{text} names a member twice", "name each once")
+        raise UserError("ego.partners", f"{text} has no members", "choose another population")
     data = (population.path / MANIFEST).read_bytes()
     return NamedMembers(population, members, hashlib.sha256(data).hexdigest())
 

@@ -36,6 +36,18 @@ def find_ego_method(name: str) -> str:
     return found
 
 
+def refuse_derived(ego: Mapping[str, Any]) -> None:
+    """Make sure that settings of an ego leave out what follows from the populations that are named.
+
+    Raises:
+        UserError: they name partners, or pin them.
+    """
+    for name in ("partners", "pinned"):
+        if ego.get(name):
+            fix = "leave it out, and name them as words of their own: PATH or PATH:1,3"
+            raise UserError(f"ego.{name}", "follows from the populations that are named", fix)
+
+
 def environment_of(partners: Sequence[str]) -> EnvironmentInfo:
     """The environment of the first population.
 
@@ -58,9 +70,11 @@ def make_ego_config(
         scale: the recipe.
 
     Raises:
-        UserError: a method that trains no ego, a setting that does not exist, partners that do not fit.
+        UserError: a method that trains no ego, a setting that does not exist or follows from `partners`, partners that
+            do not fit.
     """
     method, settings = find_ego_method(method), dict(settings or {})
+    refuse_derived({key.removeprefix("ego."): value for key, value in settings.items() if key.startswith("ego.")})
     name = settings.get("env.name", "overcooked/cramped_room")
     if partners:
         info = environment_of(partners)

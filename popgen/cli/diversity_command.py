@@ -25,9 +25,15 @@ def add(commands: Any) -> None:
         "those of popgen/reports/diversity_report.py and files.",
     )
     parser.add_argument(
-        *("populations",), metavar="[NAME=]POPULATION", nargs="+", type=named_path, help="partners, of one environment"
+        *("populations",),
+        metavar="[NAME=]POPULATION",
+        nargs="+",
+        type=named_path,
+        help="partners, of one environment; PATH:1,3 for some members only",
     )
-    parser.add_argument("--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them")
+    parser.add_argument(
+        "--choose", type=at_least(1), default=None, metavar="K", help="the most diverse K of them, as --with takes them"
+    )
     add_response_options(parser)
     parser.add_argument("--episodes", type=at_least(2), default=20, help="for each partner and seat (%(default)s)")
     parser.add_argument(
@@ -45,7 +51,13 @@ def measure(args: argparse.Namespace) -> int:
     from popgen.evaluation.holdout_players import open_sides
     from popgen.evaluation.partner_diversity import measure_partners
     from popgen.pipelines.best_responses import ResponseTraining, find_responses
-    from popgen.reports.diversity_report import describe_diversity, list_lines, list_sheets, write_report
+    from popgen.reports.diversity_report import (
+        describe_diversity,
+        list_commands,
+        list_lines,
+        list_sheets,
+        write_report,
+    )
     from popgen.reports.method_titles import title_of
     from popgen.runs.preflight import check_root
 
@@ -78,4 +90,6 @@ def measure(args: argparse.Namespace) -> int:
         print_json({**report, "files": {name: str(path) for name, path in files.items()}})
         return OK
     print_report(list_sheets(report), list_lines(report), args.out, files, width=110)
+    for command in list_commands(report):
+        print(f"to hold these out: {command}")
     return OK

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import Parser, add_command, add_config_dir
@@ -36,15 +37,22 @@ def add(commands: Any) -> None:
     add_config_dir(train)
 
 
+def is_population(word: str) -> bool:
+    """Whether a word names a folder, or members of what is in it, whatever else it might be."""
+    from popgen.population.chosen_members import split_members
+
+    return Path(split_members(word)[0]).expanduser().is_dir()
+
+
 def train_ego(args: argparse.Namespace) -> int:
     """Train an ego, or say what would be done."""
     bound_threads(1)
     from popgen.config.run_config import RunConfig
     from popgen.methods.registry import DEFAULT_EGO
-    from popgen.pipelines.ego_training import environment_of, find_ego_method, pin_partners
+    from popgen.pipelines.ego_training import environment_of, find_ego_method, pin_partners, refuse_derived
 
-    partners = [word for word in args.overrides if "=" not in word]
-    overrides = [word for word in args.overrides if "=" in word]
+    partners = [word for word in args.overrides if "=" not in word or is_population(word)]
+    overrides = [word for word in args.overrides if word not in partners]
     keys = [word.lstrip("+").partition("=")[0] for word in overrides]
     method = dict(word.partition("=")[::2] for word in overrides).get("method", DEFAULT_EGO)
     overrides = [*(word for word in overrides if not word.startswith("method=")), f"method={find_ego_method(method)}"]
@@ -54,6 +62,7 @@ def train_ego(args: argparse.Namespace) -> int:
         values["env"] = {"name": info.name, "params": info.params}
     else:
         values = compose(overrides, args.config_dir)
+    refuse_derived(values.get("ego") or {})
     if partners:
         values.setdefault("ego", {})["partners"] = partners
     return execute(pin_partners(RunConfig.parse(values)), args)

@@ -37,33 +37,7 @@ def add(commands: Any) -> None:
         "Keys of --json: files, and those of popgen/reports/crossplay_report.py (sp, xp, matrix, beside, obstruction, "
         "pairs, ...) or, with --with, of popgen/reports/holdout_report.py (standings, controls, margins, pairs, ...).",
     )
-    parser.add_argument(
-        *("populations",),
-        metavar=_NAMED,
-        nargs="+",
-        type=named_path,
-        help="population or its run; with --with also module:Agent, and one NAME for several seeds of an ego",
-    )
-    parser.add_argument(
-        *("--with",),
-        dest="partners",
-        metavar=_NAMED,
-        nargs="+",
-        action="extend",
-        type=named_path,
-        help="hold-out partners: populations, or agents as module:Agent",
-    )
-    parser.add_argument(
-        "--human", metavar=_NAMED, nargs="+", action="extend", type=named_path, help="human proxies as partners"
-    )
-    parser.add_argument(
-        *("--met",),
-        metavar=_NAMED,
-        nargs="+",
-        action="extend",
-        type=named_path,
-        help="populations that taught the egos: rows of their own, in no average",
-    )
+    _add_players(parser)
     parser.add_argument("--control", metavar="NAME", help="an ego over which the others' margins are told")
     parser.add_argument(
         "--best-responses", action="store_true", help="train the best responses that are missing to all partners first"
@@ -78,6 +52,25 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--param", type=pair, action="append", default=[], metavar="KEY=VALUE", help="the same for a parameter of it"
     )
+
+
+def _add_players(parser: argparse.ArgumentParser) -> None:
+    """Who is evaluated, and beside whom."""
+    parser.add_argument(
+        *("populations",),
+        metavar=_NAMED,
+        nargs="+",
+        type=named_path,
+        help="population or its run; with --with also PATH:1,3 for some members, module:Agent, and one NAME for "
+        "several seeds of an ego",
+    )
+    partners = "hold-out partners: populations, PATH:1,3 for some members only, or agents as module:Agent"
+    for option, name, told in (
+        ("--with", "partners", partners),
+        ("--human", "human", "human proxies as partners"),
+        ("--met", "met", "populations that taught the egos: rows of their own, in no average"),
+    ):
+        parser.add_argument(option, dest=name, metavar=_NAMED, nargs="+", action="extend", type=named_path, help=told)
 
 
 def evaluate(args: argparse.Namespace) -> int:

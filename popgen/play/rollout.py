@@ -125,6 +125,7 @@ class Seating:
             check(obs, (len(self.seats), self.seats.shape[1], *obs.shape[2:]), f"observations[{policy.view!r}]")
             chosen = np.asarray(policy.act(obs[rows], self._actions[rows], self._first[rows]))
             check(chosen, (len(rows), self.seats.shape[1]), f"actions of policy {k}")
+            _check_narrow(chosen, f"actions of policy {k}")
             own = self.seats[rows] == k
             part = actions[rows]
             part[own] = chosen[own]
@@ -169,6 +170,16 @@ class Seating:
     def _remembering_policies(self) -> dict[int, Remembering]:
         seated = ((k, self.policies[k]) for k, _ in self._rows)
         return {k: policy for k, policy in seated if isinstance(policy, Remembering)}
+
+
+def _check_narrow(actions: np.ndarray, name: str) -> None:
+    """Raise ValueError unless bytes hold the actions as they are: a cast would make others of 1.7 or 260."""
+    if actions.dtype == np.uint8:
+        return
+    if actions.dtype.kind not in "iu":
+        raise ValueError(f"{name}: need whole numbers, got {actions.dtype}")
+    if actions.min() < 0 or actions.max() > 255:
+        raise ValueError(f"{name}: need numbers from 0 to 255, got {actions.min()} to {actions.max()}")
 
 
 # ---- steps -----------------------------------------------------------------------------------------------------------

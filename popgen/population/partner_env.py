@@ -15,7 +15,8 @@ from gymnasium import spaces
 
 from popgen.envs.reward import training_reward
 from popgen.errors import UserError
-from popgen.population.store import Population, check_compatible, load_population
+from popgen.population.chosen_members import ChosenMembers, load_members
+from popgen.population.store import Population, check_compatible
 
 REWARDS = ("events", "environment")
 
@@ -37,7 +38,7 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
     and `seat` (the agent's), and at every step the team's `score`.
 
     Args:
-        populations: one or several of one environment.
+        populations: one or several of one environment, or members of them.
         view: a flat view of the environment.
         reward: `events`, what popgen's methods learn from, or `environment`, the environment's own joint reward.
         render_mode: `rgb_array` or None.
@@ -50,18 +51,19 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
 
     def __init__(
         self,
-        populations: Sequence[Population],
+        populations: Sequence[Population | ChosenMembers],
         *,
         view: str = "features",
         reward: str = "events",
         render_mode: str | None = None,
     ) -> None:
-        if not populations or not all(len(population) for population in populations):
+        chosen = [one if isinstance(one, ChosenMembers) else ChosenMembers.of_all(one) for one in populations]
+        if not chosen or not all(one.members for one in chosen):
             raise UserError("populations", "hold no members", "give one that does")
-        self._env = populations[0].make_env()
+        self._env = chosen[0].population.make_env()
         spec = self._env.spec
-        for population in populations:
-            check_compatible(population, spec)
+        for one in chosen:
+            check_compatible(one.population, spec)
         if view not in spec.views or len(spec.views[view].shape) != 1:
             raise UserError("view", f"{view!r} is no flat view of {spec.name}", "choose features")
         if reward not in REWARDS:
@@ -69,8 +71,8 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError("render_mode", f"{render_mode!r} is unknown", "choose rgb_array or None")
         self._view, self._reward, self.render_mode = view, reward, render_mode
-        self._members = [(str(one.path), member) for one in populations for member in range(1, len(one) + 1)]
-        self._partners = [policy for one in populations for policy in one]
+        self._members = [(str(one.population.path), member) for one in chosen for member in one.members]
+        self._partners = [one.population[member] for one in chosen for member in one.members]
         self._partner, self._seat = 0, 0
         self._previous = np.zeros((1, spec.num_players), np.uint8)
         self._first = np.ones(1, bool)
@@ -99,7 +101,9 @@ class PartnerEnv(gymnasium.Env[np.ndarray, int]):
         return self._observe_seat(), self._describe_step(0.0)
 
     def step(self, action: int) -> SeatStep:
-        """The agent's action beside its partner's."""
+        """The agent's action beside its partner's; raises ValueError for an action that there is not."""
+        if not self.action_space.contains(action):
+            raise ValueError(f"action: need a whole number below {self._env.spec.num_actions}, got {action!r}")
         partner = self._partners[self._partner]
         joint = partner.act(self._env.observe(partner.view), self._previous, self._first).copy()
         joint[0, self._seat] = action
@@ -131,11 +135,12 @@ def make_partner_env(
     """A Gymnasium environment with one seat taken by sampled members of one or several populations.
 
     Args:
-        populations: folders, or what `load_population` gave; all of one environment.
+        populations: folders, each with `:1,3` behind it for some members only, or what `load_population` gave; all of
+            one environment.
         view, reward, render_mode: see `PartnerEnv`.
 
     Raises:
-        UserError: what `load_population` and `PartnerEnv` refuse.
+        UserError: what `load_members` and `PartnerEnv` refuse.
     """
-    loaded = [one if isinstance(one, Population) else load_population(one) for one in populations]
+    loaded = [one if isinstance(one, Population) else load_members(str(one)) for one in populations]
     return PartnerEnv(loaded, view=view, reward=reward, render_mode=render_mode)

@@ -173,7 +173,6 @@ def list_lines(report: Mapping[str, Any]) -> list[str]:
         if len(one["chosen"]) < len(partners):
             names = ", ".join(f"{partners[n]['group']} {partners[n]['member']}" for n in one["chosen"])
             lines.append(f"most diverse {len(one['chosen'])} over {name}: {names}")
-            lines.append(f"to hold these out: popgen evaluate EGO --with {shlex.join(one['hold_out'])}")
         if one["rank"] < len(partners):
             told = f"over {name} only {one['rank']} of {len(partners)} partners are linearly independent"
             lines.append(f"{told}: the determinant is 0, its logarithm has no value")
@@ -190,6 +189,12 @@ def list_lines(report: Mapping[str, Any]) -> list[str]:
         lines.append("of ln members: trajectories' share of the most there is; populations of any size compare by it")
     steps = report["steps"]["evaluation"]
     return [*lines, f"{report['episodes']} episodes for each partner and seat, {steps:,} environment steps"]
+
+
+def list_commands(report: Mapping[str, Any]) -> list[str]:
+    """How each set of chosen partners is held out, to be copied."""
+    found = [one["hold_out"] for one in report["over"].values() if len(one["chosen"]) < len(report["partners"])]
+    return list(dict.fromkeys(f"popgen evaluate EGO --with {shlex.join(words)}" for words in found))
 
 
 def write_report(report: Mapping[str, Any], folder: str | Path) -> dict[str, Path]:
@@ -216,10 +221,11 @@ def write_report(report: Mapping[str, Any], folder: str | Path) -> dict[str, Pat
     first, *others = list_sheets(report)
     tables = "".join(f"\n\n## {sheet.title}\n\n{sheet.to_markdown()}" for sheet in others)
     lines = "".join(f"- {line}\n" for line in list_lines(report))
+    commands = "".join(f"\n    {line}\n" for line in list_commands(report))
     texts = {
         "json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "csv": to_csv(rows, (*CSV_FIELDS, *columns)),
-        "md": f"# {first.title}\n\n{first.to_markdown()}{tables}\n\n{lines}",
+        "md": f"# {first.title}\n\n{first.to_markdown()}{tables}\n\n{lines}{commands}",
     }
     paths = {suffix: folder / f"diversity.{suffix}" for suffix in texts}
     try:

@@ -46,6 +46,8 @@ BAD_OVERRIDES = {
     "unknown family": (["env.name=chess/board"], "env.name"),
     "layout without its family": (["env=cramped_room"], "did you mean env=overcooked/cramped_room?"),
     "layout file that is not there": (["env.name=overcooked/gone.layout"], "gone.layout"),
+    "no grid": (["env=overcooked/custom"], "env.params.grid: is missing"),
+    "no grid by name": (["env.name=overcooked/custom"], "env.params.grid: is missing"),
     "grid without a pot": (["env=overcooked/custom", "env.params.grid='XXXXX/O1 2O/X   X/XDXSX'"], "env.params.grid"),
     "unreachable dispenser": (["env=overcooked/custom", WALLED_DISH], "env.params.grid"),
     "ragged grid": (["env=overcooked/custom", "env.params.grid='XXPXX/O1 2O/X  X/XDXSX'"], "env.params.grid"),

@@ -217,6 +217,17 @@ def test_of_equal_references_a_trained_one_is_named_first_and_mates_need_one_pop
     assert np.isnan(played(replace(casting, partners=(apart,))).partner_mates).all()
 
 
+def test_a_mate_that_was_not_chosen_is_a_reference_all_the_same() -> None:
+    """Of the pair STAY and TWO only STAY is held out: beside it its mate has 12 in seat 0 and 120 in seat 1."""
+    whole = pair_up(group("H", "hsp", [STAY], [TWO]), 3, 3)
+    alone = replace(whole, players=(replace(whole.players[0], mate=whole.players[1]),))
+    result = played(Casting((group("e", None, [STAY]),), (alone,)))
+    assert result.partner_mates[:, :, 0].tolist() == [[12, 120]] and result.scores.shape[:2] == (1, 1)
+    report = to_dict(result)
+    assert report["reference"][0]["of"] == ["mate"] * 2
+    assert [player["mate"] for player in report["partners"][0]["players"]] == [2]
+
+
 def test_egos_of_a_pair_have_their_mate_as_a_control() -> None:
     egos = (pair_up(group("H", "hsp", [STAY], [TWO]), 1, 1),)
     result = played(Casting(egos, (group("p", None, [ONE]),)))

@@ -22,7 +22,7 @@ from popgen.evaluation.holdout_lineages import (
     read_people,
 )
 from popgen.evaluation.holdout_overlap import check_disjoint, check_met
-from popgen.evaluation.holdout_players import EGO, Group, Player, open_sides
+from popgen.evaluation.holdout_players import EGO, Group, Player, open_sides, seat_mates
 from popgen.methods.mappo.config import MappoRun
 from popgen.methods.mappo.method import MAPPO
 from popgen.methods.registry import METHODS
@@ -261,7 +261,7 @@ def teach(*teachers: str) -> list[dict[str, object]]:
     return [source.as_dict() for source in describe_partners([read_partner(text) for text in teachers])]
 
 
-def open_both(ego: Path, held: Path) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
+def open_both(ego: Path | str, held: Path | str) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
     opened = open_sides({EGO: [("ego", str(ego))], "partner": [("held", str(held))]}, str)
     return opened.sides[EGO], opened.sides["partner"]
 
@@ -284,6 +284,52 @@ def test_an_egos_record_tells_of_its_teachers_teachers_and_of_all_their_populati
     check_disjoint(*open_both(second, make("other", "lipo", 2, (20, 21))))
     (group,) = open_both(second, lipo)[0]
     assert group.on_record and group.taught_by == {"hipt", "lipo"}
+
+
+def test_of_chosen_members_the_whole_population_counts(make: Make) -> None:
+    """Members 1 and 2 of an ego's teachers go on in another population, whose member 3 is new."""
+    lipo = make("lipo", "lipo", 1, (1, 2))
+    ego = make("ego", "hipt", 5, (10, 11), trained_with=teach(f"{lipo}:1"))
+    continued = make("continued", "lipo", 2, (1, 2, 7))
+    with pytest.raises(UserError, match="held: is of a population that holds members of the ego ego or of those that"):
+        check_disjoint(*open_both(f"{ego}:2", f"{continued}:3"))
+    with pytest.raises(UserError, match="held: has seed 1 of lipo"):
+        check_disjoint(*open_both(f"{ego}:2", f"{make('seed', 'lipo', 1, (8, 9))}:2"))
+    egos, partners = open_both(f"{ego}:2", f"{make('other', 'lipo', 2, (20, 21, 22))}:3,1")
+    check_disjoint(egos, partners)
+    assert [one.member for one in egos[0].players] == [2] and [one.member for one in partners[0].players] == [3, 1]
+    check_met(egos, open_both(ego, f"{lipo}:1")[1])
+    with pytest.raises(UserError, match="trained none of the egos"):
+        check_met(egos, open_both(ego, lipo)[1])
+
+
+def test_members_of_one_population_may_have_several_names_and_each_counts_once(make: Make) -> None:
+    ego, held = make("ego", "hipt", 5, (10,)), make("held", "lipo", 2, (1, 2, 3))
+
+    def open_partners(*named: tuple[str, str]) -> list[tuple[str, list[int], int]]:
+        groups = open_sides({EGO: [("ego", str(ego))], "partner": named}, str).sides["partner"]
+        return [(one.label, [player.member for player in one.players], len(one.lineages)) for one in groups]
+
+    assert open_partners(("a", f"{held}:1"), ("b", f"{held}:3,2")) == [("a", [1], 1), ("b", [3, 2], 1)]
+    assert open_partners(("a", f"{held}:1"), ("a", f"{held}:3")) == [("a", [1, 3], 1)]
+    for other in ("a", "b"):
+        with pytest.raises(UserError, match="held: member 1 is given twice"):
+            open_partners(("a", f"{held}:1"), (other, str(held)))
+
+
+def test_the_mate_of_a_chosen_member_stays_its_mate(make: Make, tmp_path: Path) -> None:
+    """Two pairs of HSP: of members 1 and 4 both mates are not chosen, of 1 and 2 each is the other's."""
+    spec = make_env("overcooked/cramped_room", 1, horizon=20).spec
+    writer = PopulationWriter(tmp_path / "pairs", spec, method="hsp", config_digest="0" * 64, seed=3)
+    for number in range(4):
+        policy = FeedForwardPolicy(spec.views["features"], spec.num_actions, units=8, seed=number)
+        extra = {"pair": 1 + number // 2, "role": ("biased", "partner")[number % 2]}
+        writer.add_member(policy, seed=number, steps={}, extra=extra)
+    ego = make("ego", "hipt", 5, (10,))
+    for chosen, mates, beside in (("1,4", [2, 3], [2, 3]), ("1,2", [1, 0], []), ("2", [1], [1])):
+        (group,) = open_both(ego, f"{tmp_path / 'pairs'}:{chosen}")[1]
+        everybody, places = seat_mates(group.players)
+        assert (places, [one.member for one in everybody[len(group.players) :]]) == (mates, beside)
 
 
 def test_a_clones_games_reach_an_egos_record(make: Make) -> None:

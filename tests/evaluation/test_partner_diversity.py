@@ -57,6 +57,17 @@ def test_those_of_a_pair_are_counted_beside_each_other_and_spread_by_role() -> N
     assert biased.high - biased.value == pytest.approx(2 * math.sqrt(2 / 3 * 0.5), rel=1e-3)
 
 
+def test_a_mate_that_was_not_chosen_plays_and_is_not_counted() -> None:
+    """ONE beside TWO: the counts are those of ONE alone."""
+    one, two = players([ONE], [TWO])
+    got = measure_partners(TallyEnv, [replace(one, pair=1, mate=two)], None, 1, 0)  # type: ignore[arg-type]
+    assert got.counts.tolist() == [[6, 0]]
+    counts, _ = count_events(
+        *(TallyEnv, [replace(one, pair=1, mate=two)], players([TWO]), 1, 0)  # type: ignore[arg-type]
+    )
+    assert counts.tolist() == [[0, 6]], "of its response, beside it and not beside the mate"
+
+
 def test_the_most_diverse_are_chosen() -> None:
     """Two of ONE and one of TWO: the pair that differs."""
     got = measure_partners(TallyEnv, players([ONE], [ONE], [TWO]), None, 1, 0, choose=2)  # type: ignore[arg-type]

@@ -17,6 +17,8 @@ SAYS = {
     "measure_population.py": ["<Population of 2 members", "seat_1", "member 2 beside a random partner: <5 episodes"],
     "partner_for_an_agent.py": ["episode 0: ", "episode 1: ", "score"],
     "kitchen_of_ones_own.py": ["<OvercookedEnv overcooked/alcove: 8 environments", "dishes of random play"],
+    "my_agent.py": ["beside XPM-WM 1: ", "beside XPM-WM 2: ", "dishes in seat 0"],
+    "prepare_a_hold_out_set.py": ["held out: XPM-WM=", "two_random:", "beside 1 of 2 partners, in both seats"],
     "train_an_ego_with_sb3.py": ["points of training reward an episode"],
 }
 

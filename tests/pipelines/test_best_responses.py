@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -231,6 +232,17 @@ def test_diversity_is_printed_and_refuses_in_one_line(run: Run, tmp_path: Path) 
     head = Path("diversity/diversity.csv").read_text().splitlines()[0].split(",")
     assert head[4:] == [f"event:{name}" for name in told["count_names"]] and "event:delivery" in head
     assert len(told["kind_names"]) == len(told["kinds"][0]) == 28 and told["kind_names"][0].endswith("_seat_0")
+    (word,) = told["hold_out"]
+    assert word == f"LIPO={held}:{told['chosen'][0] + 1}"
+    command = f"popgen evaluate EGO --with {shlex.quote(word)}"
+    assert out.splitlines()[-1] == f"to hold these out: {command}"
+    assert Path("diversity/diversity.md").read_text().endswith(f"\n\n    {command}\n")
+    words = (str(population(tmp_path / "ego", "mappo", 1, 1)), "--with", *told["hold_out"], "--episodes", "1")
+    code, out, err = run("evaluate", *words, "--out", "holdout", "--quiet")
+    (partner,) = json.loads(Path("holdout/holdout.json").read_text())["partners"]
+    assert code == 0 and [one["member"] for one in partner["players"]] == [told["chosen"][0] + 1]
+    code, out, err = run("evaluate", words[0], "--with", f"{held}:3", "--quiet")
+    assert code == 2 and err.splitlines() == [f"popgen: error: {held}:3: has no member 3; {held} has 2"]
     code, out, err = run("diversity", str(held), "--choose", "3")
     assert code == 2 and "--choose" in err and err.count("\n") == 1
     copies = population(tmp_path / "copies", "lipo", 2, 2, 2, 3)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -28,6 +31,9 @@ from popgen.types import Kind
 
 SETTINGS: dict[str, Any] = {"run.seed": 3, "ego.steps": 640, "tracking.enabled": False, "ego.unroll": 40}
 ROUNDS = 4
+
+
+Run = Callable[..., tuple[int, str, str]]
 
 
 class Killed(RuntimeError):
@@ -124,6 +130,33 @@ def test_what_cannot_be_trained_is_told_in_one_line(partners: Path) -> None:
         with pytest.raises(UserError) as caught:
             preflight(make_ego_config(method, named, {**SETTINGS, **settings}, scale="smoke"))
         assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    "word", ["ego.partners=[elsewhere]", "+ego.partners=[elsewhere]", "ego={partners:[elsewhere]}", "ego.pinned=[abc]"]
+)
+def test_what_follows_from_the_populations_is_not_given_beside_them(run: Run, partners: Path, word: str) -> None:
+    given = ("ego", "train", "scale=smoke", word, "run.transport=inline", "--dry-run")
+    for words in ((*given, f"{partners}:1"), given):
+        code, _, err = run(*words)
+        assert code == 2 and len(err.splitlines()) == 1, err
+        assert "follows from the populations that are named" in err or word.startswith("+"), err
+    with pytest.raises(UserError, match=r"ego.pinned: follows from"):
+        make_ego_config("fcp", [str(partners)], {"ego.pinned": ["abc"]}, scale="smoke")
+
+
+def test_a_folder_is_a_population_whatever_its_name(
+    run: Run, partners: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("seed=1", "a:b=c"):
+        shutil.copytree(partners, tmp_path / name)
+    given = ("ego", "train", "scale=smoke", "seed=4", "run.transport=inline", "--dry-run", "--json")
+    for words in (["seed=1"], ["seed=1:2", "a:b=c:1"], [str(tmp_path / "seed=1")]):
+        code, out, err = run(*given, *words)
+        told = json.loads(out)
+        assert (code, err, told["ego"]["partners"], told["run"]["seed"]) == (0, "", words, 4)
+    assert run(*given, "seed=1:4")[0] == 2
 
 
 def test_a_population_means_each_of_its_policies_once(tmp_path: Path) -> None:

@@ -55,6 +55,22 @@ def test_a_step_is_the_environments_with_the_partners_action(population: Path, s
         assert (terminated, truncated) == (False, step == HORIZON - 1)
 
 
+def test_chosen_members_alone_play(population: Path) -> None:
+    env = popgen.make_partner_env(f"{population}:2", population)
+    met = [env.reset(options={"partner": n})[1]["member"] for n in range(3)]
+    assert met == [2, 1, 2]
+    with pytest.raises(UserError, match="has no member 3"):
+        popgen.make_partner_env(f"{population}:3")
+
+
+@pytest.mark.parametrize("action", [6, -1, 260, 1.7, np.int64(260), np.float64(1.0)])
+def test_no_other_action_takes_the_place_of_one_that_there_is_not(population: Path, action: int) -> None:
+    env = popgen.make_partner_env(population)
+    env.reset()
+    with pytest.raises(ValueError, match="need a whole number below 6"):
+        env.step(action)
+
+
 def test_what_cannot_work_is_refused(population: Path) -> None:
     for wrong in ({"view": "lossless"}, {"reward": "none"}, {"render_mode": "human"}):
         with pytest.raises(UserError):
