@@ -24,6 +24,10 @@ MEASURE_SECONDS = 10.0
 """That a measure takes, until one has been made."""
 
 
+HOLDOUT = "holdout"
+"""The measure of an ego beside its hold-outs, of which each target has its own."""
+
+
 @dataclass(frozen=True)
 class ComposedRun:
     """A checked configuration, and the overrides that give it."""
@@ -92,6 +96,20 @@ class Job:
         self._done = self._done or is_finished(self.folder)
         return self._done
 
+    @property
+    def key(self) -> str:
+        """The folder, and of an ego against whom it is held: one ego may be in several targets, each with its own."""
+        return f"{self.folder}|{self.name_holdouts()}"
+
+    def name_file(self, measure: str) -> str:
+        """Of a measure."""
+        return f"{self.folder.name}.{measure}{self.name_holdouts() if measure == HOLDOUT else ''}.json"
+
+    def name_holdouts(self) -> str:
+        """A short name of whom an ego is held against, empty where that is nobody."""
+        whom = ", ".join(f"{one.row} {one.seed}" for one in self.wanted.holdouts)
+        return f"-{hashlib.sha256(whom.encode()).hexdigest()[:8]}" if whom else ""
+
 
 class Pieces:
     """All pieces of a plan.
@@ -124,8 +142,8 @@ class Pieces:
             self._add_job(needed)
         if run not in self._keys:
             job = self._make_ego_job(run) if run.teachers else self._make_job(run)
-            self._keys[run] = str(job.folder)
-            self.jobs.setdefault(str(job.folder), job)
+            self._keys[run] = job.key
+            self.jobs.setdefault(job.key, job)
         job = self.find_job(run)
         job.people = job.people or run.people
         job.measures += [name for name in run.measures if name not in job.measures]
@@ -217,8 +235,8 @@ class Pieces:
         return self.read_measured(job, name) is not None
 
     def find_measured(self, job: Job, name: str) -> Path:
-        """The file of a measure."""
-        return self.plan.out / "measured" / f"{job.folder.name}.{name}.json"
+        """The file of a measure, of an ego's hold-outs one for each set of them."""
+        return self.plan.out / "measured" / job.name_file(name)
 
     def read_measured(self, job: Job, name: str) -> dict[str, Any] | None:
         """Its figures; None where it is not there, has another meaning, or was made with other episodes or of another
@@ -231,9 +249,9 @@ class Pieces:
     def count_pieces(self, target: Target) -> dict[str, int]:
         """Of a target: runs, runs done, measures, measures done."""
         jobs, wanted = self.list_jobs(target), self.wanted[target.name]
-        told = [run for run in wanted if self.find_recorded(target, run) is not None]
+        told = [run for run in wanted if self.find_recorded(target, run)]
         own = [(self.find_job(run), name) for run in wanted if run not in told for name in run.measures]
-        measures = list({(str(job.folder), name): (job, name) for job, name in own}.values())
+        measures = {self.find_measured(job, name): (job, name) for job, name in own}.values()
         measures_told = sum(len(run.measures) for run in told)
         return {
             "runs": len(jobs) + len(told),
@@ -244,7 +262,7 @@ class Pieces:
 
     def list_all_jobs(self) -> list[Job]:
         """Of all targets, each once."""
-        return list({str(job.folder): job for target in self.plan.targets for job in self.list_jobs(target)}.values())
+        return list({job.key: job for target in self.plan.targets for job in self.list_jobs(target)}.values())
 
     def list_jobs(self, target: Target) -> list[Job]:
         """Of a target, what its runs need first; without runs that an earlier record tells."""
@@ -254,7 +272,7 @@ class Pieces:
                 continue
             for one in (*run.needs, run):
                 job = self.find_job(one)
-                found[str(job.folder)] = job
+                found[job.key] = job
         return list(found.values())
 
     def estimate_seconds(self, target: Target | None = None) -> float:
@@ -267,9 +285,9 @@ class Pieces:
             if job.done and seconds is not None:
                 times.setdefault(_kind_of(job), []).append(seconds)
         usual = 60 * self.plan.budget.minutes
-        left = sum(_average(times.get(_kind_of(job), []), usual) for job in jobs if not job.done)
+        runs = {job.folder: _average(times.get(_kind_of(job), []), usual) for job in jobs if not job.done}
         todo = [name for job in jobs for name in job.measures if not self.is_measured(job, name)]
-        return left + MEASURE_SECONDS * len(todo) * (self.plan.budget.episodes / 20)
+        return sum(runs.values()) + MEASURE_SECONDS * len(todo) * (self.plan.budget.episodes / 20)
 
     def find_piece(self, job: Job) -> Path:
         """The file that says who made a run."""

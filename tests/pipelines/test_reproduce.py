@@ -203,6 +203,23 @@ def test_an_ego_of_a_teacher_of_elsewhere_is_another_ego(run: Run, training: Tra
     assert own == list_egos() and len(own) == len(taken) and own.isdisjoint(taken)
 
 
+def test_an_ego_of_two_targets_is_one_run_with_the_hold_outs_of_each() -> None:
+    """The egos' table holds XPM-Sim's population out too, that of the generators does not."""
+    work = plan_pieces("all", "--budget", "smoke")
+    jobs = [
+        work.find_job(one)
+        for name, row in (("ego", "XPM-WM, one level"), ("generators", "XPM-WM"))
+        for one in work.wanted[name]
+        if one.teachers and one.row == row and one.method == "fcp"
+    ]
+    first, second = jobs[0], next(job for job in jobs[1:] if job.wanted.row == "XPM-WM")
+    assert first.folder == second.folder
+    titles = [{one.row for one in job.wanted.holdouts} for job in (first, second)]
+    assert titles[0] - titles[1] == {"XPM-Sim"} and titles[1] < titles[0]
+    assert work.find_measured(first, "holdout") != work.find_measured(second, "holdout")
+    assert work.find_measured(first, "human") == work.find_measured(second, "human")
+
+
 def test_settings_that_only_egos_have_are_of_the_egos(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     work = plan_pieces("ego", "ego.steps=500", "evaluation.episodes=3", "--budget", "smoke")
     (ego, *_) = (job for job in work.jobs.values() if job.config is None)
