@@ -144,8 +144,8 @@ def describe_trial(run: SweepRun, config_dir: str | None, local: bool) -> dict[s
         amounts = {f"node:{ray.util.get_node_ip_address()}": 0.001}
     elif run.config.run.transport == "inline":
         amounts = {"CPU": 1.0}
-    else:
-        amounts = total(demands(run.config))
+    else:  # the driver takes a core itself where no actor does
+        amounts = {name: amount for name, amount in total(demands(run.config)).items() if amount} or {"CPU": 1.0}
     return {
         "name": str(run.config.run.id),
         "command": run.command(config_dir),

@@ -126,6 +126,8 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     chosen = _choose_groups(translated, overrides, folder)
     schema = schema_of(chosen)
     recipes = METHODS[chosen["method"]].recipes
+    if not isinstance(chosen["scale"], str):
+        raise UserError("scale", "the preset sets a section `scale`", "begin its file with: # @package _global_")
     if (name := chosen["scale"]) not in recipes and name not in group_options("scale", folder):
         raise UserError("scale", f"{chosen['method']} has no recipe {name!r}", f"choose one of {', '.join(recipes)}")
     recipe = recipes.get(name, recipes[DEFAULT_RECIPE])

@@ -152,11 +152,11 @@ def find_budget(name: str, layouts: Sequence[str] | None = None) -> Budget:
 def _make_composer(shared: Sequence[str], config_dir: str | None) -> Any:
     """Overrides -> a run; a shared setting that only other methods have is left out."""
     from popgen.config.run_config import RunConfig, field_names
-    from popgen.methods.registry import METHODS
+    from popgen.methods.registry import list_working
     from popgen.pipelines.reproduction_pieces import ComposedRun
     from popgen.runs.preflight import preflight
 
-    fields = {name: set(field_names(method.config)) for name, method in METHODS.items()}
+    fields = {name: set(field_names(method.config)) for name, method in list_working()}
     everywhere = set().union(*fields.values())
 
     def compose_run(words: Sequence[str]) -> ComposedRun:
@@ -177,11 +177,11 @@ def _read_ego_settings(budget: Budget, overrides: Sequence[str], config_dir: str
         UserError: a value that does not fit.
     """
     from popgen.config.run_config import RunConfig, field_names
-    from popgen.methods.registry import DEFAULT_EGO, METHODS
+    from popgen.methods.registry import DEFAULT_EGO, METHODS, list_working
     from popgen.pipelines.ego_training import find_ego_method
 
     method = find_ego_method(DEFAULT_EGO)
-    populations = (set(field_names(one.config)) for one in METHODS.values() if not one.trains_ego)
+    populations = (set(field_names(one.config)) for _, one in list_working() if not one.trains_ego)
     own = set(field_names(METHODS[method].config)).difference(*populations)
     words = [word for word in overrides if word.partition("=")[0] in own]
     if not words:

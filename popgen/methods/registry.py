@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint
@@ -107,7 +108,7 @@ def find_method(name: object) -> Method:
 
 def list_objectives() -> list[str]:
     """`method:objective` of every row that a table of self-sabotage can have, self-play first."""
-    labels = [f"{name}:{objective}" for name, method in METHODS.items() for objective in method.objectives]
+    labels = [f"{name}:{objective}" for name, method in list_working() for objective in method.objectives]
     return sorted(labels, key=lambda label: not label.endswith(":self-play"))
 
 
@@ -127,12 +128,21 @@ def find_objective(row: str) -> Settings:
 
 def methods_with(key: str) -> list[str]:
     """Names of the methods whose schema has a dotted field."""
-    return [name for name, method in METHODS.items() if key in field_names(method.config)]
+    return [name for name, method in list_working() if key in field_names(method.config)]
 
 
 def policy_kinds() -> dict[str, str]:
     """Kinds of the policies that methods save -> `module:class`."""
-    return {kind: place for method in METHODS.values() for kind, place in method.policies.items()}
+    return {kind: place for _, method in list_working() for kind, place in method.policies.items()}
+
+
+def list_working() -> list[tuple[str, Method]]:
+    """Names and methods, without those whose package cannot be imported: who asks for another does not need it."""
+    found = []
+    for name in METHODS:
+        with suppress(UserError):
+            found.append((name, METHODS[name]))
+    return found
 
 
 def recipe(method: str, env: str = "overcooked/cramped_room", scale: str = DEFAULT_RECIPE) -> RunConfig:

@@ -193,15 +193,19 @@ def open_listening_socket(host: str, port: int) -> socket.socket:
     """A bound socket; port 0 takes a free one.
 
     Raises:
-        UserError: the port is taken, or not ours to take.
+        UserError: there is no such host or port, or the port is taken, or not ours to take.
     """
     listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((host, port))
+    except OverflowError:
+        listening.close()
+        raise UserError("--port", f"there is no port {port}", "choose one from 0 to 65535") from None
     except OSError as error:
         listening.close()
-        raise UserError("--port", f"cannot listen at {host}:{port} ({error.strerror})", "choose another one") from None
+        field = "--host" if isinstance(error, socket.gaierror) else "--port"
+        raise UserError(field, f"cannot listen at {host}:{port} ({error.strerror})", "choose another one") from None
     return listening
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from popgen.methods.registry import METHODS
+from popgen.methods.registry import METHODS, list_working
 
 __all__ = ["METHODS", "name_of", "title_of"]
 
@@ -17,4 +17,4 @@ def title_of(label: str) -> str:
 
 def name_of(title: str) -> str:
     """The method with this title; a title that no method has stays as it is."""
-    return next((name for name, method in METHODS.items() if method.title == title), title)
+    return next((name for name, method in list_working() if method.title == title), title)

@@ -96,3 +96,10 @@ def test_mistakes_are_those_of_run(run: Run) -> None:
     for words in (["lipo2"], ["agent.lamda_xp=1"], ["agent.lambda_xp=-1"], ["a", "b"]):
         code, out, err = run("config", *words)
         assert code == 2 and out == "" and err.startswith("popgen: error: ") and err.count("\n") == 1, err
+
+
+def test_a_preset_that_is_no_whole_configuration_is_told(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "scale").mkdir()
+    (tmp_path / "scale" / "mine.yaml").write_text("phase1: {target_score: 5}\n")  # without its first line
+    code, _, err = run("run", "scale=mine", "--config-dir", str(tmp_path), "--dry-run")
+    assert code == 2 and "begin its file with: # @package _global_" in err and err.count("\n") == 1

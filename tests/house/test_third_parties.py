@@ -28,6 +28,7 @@ broken = toy_popgen.nowhere:FAMILY
 rendezvous = toy_popgen.line_family:FAMILY
 [popgen.methods]
 guess = toy_popgen.guess_method:METHOD
+absent = toy_popgen.nowhere:METHOD
 """
 PRESET = """\
 # @package _global_

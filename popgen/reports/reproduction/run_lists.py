@@ -6,7 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from popgen.methods.registry import DEFAULT_EGO, METHODS, find_objective, list_objectives, methods_with, recipe
+from popgen.methods.registry import (
+    DEFAULT_EGO,
+    METHODS,
+    find_objective,
+    list_objectives,
+    list_working,
+    methods_with,
+    recipe,
+)
 from popgen.reports.method_titles import name_of, title_of
 from popgen.reports.paper_figures import BASELINES, OWN_METHOD, RENDEZVOUS, SIMULATOR_METHOD
 from popgen.reports.reproduction.target_records import Budget, WantedRun, WantedStudy
@@ -151,7 +159,7 @@ def list_study_rows(budget: Budget, seed: int) -> list[WantedRun]:
 def list_generators(budget: Budget, seeds: Sequence[int]) -> list[WantedRun]:
     """A row for each method that makes populations, in which the egos that they taught stand too: of one level, which
     take a third of the time of two."""
-    labels = [name for name, method in METHODS.items() if not method.trains_ego]
+    labels = [name for name, method in list_working() if not method.trains_ego]
     measures = [SCORES, COSTS, "diversity", "acting", "conventions"]
     populations = want_runs(budget, seeds, labels, budget.layouts, measures)
     teachers = [(label,) for label in labels]
