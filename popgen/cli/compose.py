@@ -128,7 +128,8 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     recipes = METHODS[chosen["method"]].recipes
     if not isinstance(chosen["scale"], str):
         raise UserError("scale", "the preset sets a section `scale`", "begin its file with: # @package _global_")
-    if (name := chosen["scale"]) not in recipes and name not in group_options("scale", folder):
+    own = set(group_options("scale", folder)) - set(group_options("scale"))
+    if (name := chosen["scale"]) not in recipes and name not in own:
         raise UserError("scale", f"{chosen['method']} has no recipe {name!r}", f"choose one of {', '.join(recipes)}")
     recipe = recipes.get(name, recipes[DEFAULT_RECIPE])
     base = _merge(schema.model_validate({}).as_dict(), recipe.values(chosen["env"]["name"]))

@@ -149,9 +149,11 @@ def recipe(method: str, env: str = "overcooked/cramped_room", scale: str = DEFAU
     """The complete configuration of a recipe on a layout: what the command line would start with.
 
     Raises:
-        UserError: no such method or recipe.
+        UserError: no such method or recipe, or an environment's name without its family.
     """
     found = find_method(method)
+    if "/" not in env:
+        raise UserError("env", f"{env!r} names no environment", f"name its family too, such as overcooked/{env}")
     if scale not in found.recipes:
         raise UserError("scale", f"{method} has no recipe {scale!r}", f"choose one of {', '.join(found.recipes)}")
     values: dict[str, Any] = found.recipes[scale].values(env)

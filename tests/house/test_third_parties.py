@@ -118,6 +118,8 @@ def test_its_settings_are_shown_with_their_reasons(installed: Path, run: Run) ->
     shown = rows["guess.rounds"]
     assert (shown["value"], shown["default"], shown["source"]) == (30, 8, "layout row of laptop")
     assert shown["reason"] == "chance seldom meets on a long line"
+    code, _, err = run("run", "method=guess", "env=line/short", "scale=paper", "--dry-run")
+    assert code == 2 and "guess has no recipe 'paper'" in err  # not the laptop's under another name
     code, _, err = run("config", "guess", "agent.lambda_xp=1")
     assert code == 2 and "guess does not have" in err
 

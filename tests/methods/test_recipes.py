@@ -143,3 +143,9 @@ def test_records_of_all_methods_are_read_without_what_only_training_needs() -> N
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.stdout.strip() == str(len(registry.BUILT_IN)), done.stderr
+
+
+def test_a_layout_without_its_family_is_refused() -> None:
+    """The laptop's numbers without the layout's row are no answer."""
+    with pytest.raises(UserError, match="overcooked/cramped_room"):
+        popgen.recipe("xpm_wm", "cramped_room")
