@@ -128,13 +128,17 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     recipes = METHODS[chosen["method"]].recipes
     if not isinstance(chosen["scale"], str):
         raise UserError("scale", "the preset sets a section `scale`", "begin its file with: # @package _global_")
-    own = set(group_options("scale", folder)) - set(group_options("scale"))
-    if (name := chosen["scale"]) not in recipes and name not in own:
+    if (name := chosen["scale"]) not in recipes and name not in _list_own_scales(folder):
         raise UserError("scale", f"{chosen['method']} has no recipe {name!r}", f"choose one of {', '.join(recipes)}")
     recipe = recipes.get(name, recipes[DEFAULT_RECIPE])
     base = _merge(schema.model_validate({}).as_dict(), recipe.values(chosen["env"]["name"]))
     values = _compose(base, translated, overrides, folder, lambda key: unknown_field(key, schema))
     return Composed(values, recipe.list_settings(chosen["env"]["name"]), tuple(translated), schema, folder)
+
+
+def _list_own_scales(folder: Path | None) -> set[str]:
+    """Presets of a user's folder that no file of conf/ has the name of."""
+    return set(group_options("scale", folder)) - set(group_options("scale"))
 
 
 def choose_custom_layout(words: Sequence[str]) -> list[str]:

@@ -39,7 +39,7 @@ class CheckedPolicy:
         Raises:
             UserError: it fails.
         """
-        self._call("reset", batch, seed)
+        self._call_agent("reset", batch, seed)
 
     def act(self, obs: np.ndarray, previous_actions: np.ndarray, is_first: np.ndarray) -> np.ndarray:
         """See `Policy.act`.
@@ -47,10 +47,10 @@ class CheckedPolicy:
         Raises:
             UserError: it fails, or what it gives is no action for each row and seat.
         """
-        chosen = self._call("act", obs, previous_actions, is_first)
+        chosen = self._call_agent("act", obs, previous_actions, is_first)
         return self._read_actions(chosen, previous_actions.shape)
 
-    def _call(self, method: str, *values: Any) -> Any:
+    def _call_agent(self, method: str, *values: Any) -> Any:
         try:
             return getattr(self._policy, method)(*values)
         except UserError:

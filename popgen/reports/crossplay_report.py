@@ -204,12 +204,23 @@ def has_pairs(report: Mapping[str, Any]) -> bool:
 
 def list_own_scores(report: Mapping[str, Any]) -> dict[int, float | None]:
     """Member -> mean score with its mate over both seatings, or with itself; None where it is not known."""
-    means = {(one["seat_0"], one["seat_1"]): one["score"]["mean"] for one in report["pairs"]}
-    found: dict[int, float | None] = {}
-    for member, mate in list_mates(report).items():
-        both = [means.get((str(member), str(mate))), means.get((str(mate), str(member)))]
-        known = [mean for mean in both if mean is not None]
-        found[member] = sum(known) / len(known) if known else None
+    own = estimate_play(report, list_mates(report))
+    return {member: None if math.isnan(play.mean) else play.mean for member, play in own.items()}
+
+
+def estimate_play(report: Mapping[str, Any], partners: Mapping[int, int | str]) -> dict[int, Estimate]:
+    """Member -> score with its partner, mean over the seatings that are known; NaN where none is.
+
+    Args:
+        report: of an evaluation.
+        partners: member -> another member's number, its own, `random` or `idle`.
+    """
+    known = {(one["seat_0"], one["seat_1"]): one["score"] for one in report["pairs"]}
+    found = {}
+    for member, partner in partners.items():
+        seats = dict.fromkeys([(str(member), str(partner)), (str(partner), str(member))])
+        both = [read_estimate(known[one]) for one in seats if one in known and known[one]["mean"] is not None]
+        found[member] = Estimate.average(both)
     return found
 
 
@@ -228,8 +239,7 @@ def restate_pairs(report: Mapping[str, Any], mates: Sequence[int]) -> dict[str, 
         return dict(report)
     pairs = zip(report["members"], own, strict=True)
     result = _read_result(report, {member: mate for member, mate in pairs if member != mate})
-    figures = {"sp": result.sp.to_dict(), "xp": result.xp.to_dict(), "obstruction": _describe_obstructions(result)}
-    return {**report, "mates": own, **figures, "mixed_play": _describe_mixed(result)}
+    return {**report, "mates": own, **_describe_play(result), "mixed_play": _describe_mixed(result)}
 
 
 def leave_out(report: Mapping[str, Any], members: Collection[int]) -> dict[str, Any]:
@@ -251,13 +261,15 @@ def leave_out(report: Mapping[str, Any], members: Collection[int]) -> dict[str, 
     changed = {
         "members": kept,
         "mates": list(mates.values()),
-        "sp": result.sp.to_dict(),
-        "xp": result.xp.to_dict(),
-        "obstruction": _describe_obstructions(result),
+        **_describe_play(result),
         "mixed_play": mixed,
         "pairs": [one for one in report["pairs"] if not {one["seat_0"], one["seat_1"]} & out],
     }
     return {key: value for key, value in report.items() if key not in ("matrix", "beside")} | changed
+
+
+def _describe_play(result: CrossPlayResult) -> dict[str, Any]:
+    return {"sp": result.sp.to_dict(), "xp": result.xp.to_dict(), "obstruction": _describe_obstructions(result)}
 
 
 def _read_result(report: Mapping[str, Any], mates: Mapping[int, int]) -> CrossPlayResult:

@@ -17,7 +17,7 @@ from popgen.evaluation.crossplay import RANDOM
 from popgen.evaluation.estimates import Estimate
 from popgen.evaluation.holdout_lineages import TRAINED_WITH
 from popgen.population.manifest import MemberInfo
-from popgen.reports.crossplay_report import list_mates, read_estimate
+from popgen.reports.crossplay_report import estimate_play, list_mates
 from popgen.types import FINAL_SKILL
 
 NEVER_REACHED = 1000.0
@@ -97,23 +97,16 @@ def find_weak_members(scores: Mapping[str, Any], targets: Mapping[int, float], s
         targets: by member, where its method has one.
         share: 0 finds nobody.
     """
-    played = {(one["seat_0"], one["seat_1"]): read_estimate(one["score"]) for one in scores["pairs"]}
-    own = {member: _average_both(played, member, mate) for member, mate in list_mates(scores).items()}
+    mates = list_mates(scores)
+    own, beside = estimate_play(scores, mates), estimate_play(scores, dict.fromkeys(mates, RANDOM))
     found = []
     for member, sp in own.items() if share > 0.0 else ():
         what, aim = _find_aim(own, member, targets.get(member, 0.0))
-        beside = _average_both(played, member, RANDOM)
         if aim > 0.0 and sp.mean + _double_error(sp) < share * aim:
             found.append(WeakMember(member, sp, aim, what, share))
-        elif sp.mean <= beside.mean:
-            found.append(WeakMember(member, sp, beside.mean, RANDOM_PARTNER, share))
+        elif sp.mean <= beside[member].mean:
+            found.append(WeakMember(member, sp, beside[member].mean, RANDOM_PARTNER, share))
     return found
-
-
-def _average_both(played: Mapping[tuple[str, str], Estimate], member: int, partner: int | str) -> Estimate:
-    """Mean over both seatings of those that were played."""
-    seats = dict.fromkeys([(str(member), str(partner)), (str(partner), str(member))])
-    return Estimate.average([played[one] for one in seats if one in played])
 
 
 def _find_aim(own: Mapping[int, Estimate], member: int, target: float) -> tuple[str, float]:

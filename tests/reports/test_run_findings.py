@@ -54,7 +54,10 @@ def test_good_and_weak_populations_are_told_apart() -> None:
 
 def test_members_of_pairs_are_judged_by_play_with_their_mates() -> None:
     scores = {(1, 1): 0.0, (1, 2): 9.0, (2, 1): 11.0, (2, 2): 0.0, (3, 4): 2.0, (4, 3): 2.0}
-    pairs = [{"seat_0": str(i), "seat_1": str(j), "score": {"mean": mean}} for (i, j), mean in scores.items()]
+    pairs = [
+        {"seat_0": str(i), "seat_1": str(j), "score": {"mean": mean, "standard_error": 0.1}}
+        for (i, j), mean in scores.items()
+    ]
     told = tell(sp=6.0, xp=0.1, members=[1, 2, 3, 4], mates=[2, 1, 4, 3], pairs=pairs)
     assert told["weak with their mates: members 3 (2.00), 4 (2.00); the best has 10.00"] is False
     assert "one pair: there is no cross-play" in tell(sp=6.0, xp=None, mates=[2, 1])
