@@ -115,11 +115,14 @@ def numbers(text: str) -> list[int]:
 
 
 def words(text: str) -> list[str]:
-    """Words as a shell would split them."""
+    """One word or more, as a shell would split them."""
     try:
-        return shlex.split(text)
+        found = shlex.split(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"cannot read {text!r} ({error})") from None
+    if not found:
+        raise argparse.ArgumentTypeError("names no settings: write KEY=VALUE, such as seed=1")
+    return found
 
 
 def named_path(text: str) -> tuple[str | None, str]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import expand_home
+from popgen.cli.preset_files import check_presets, describe_yaml_error, find_preset_folder
 from popgen.cli.printing import short
 from popgen.errors import UserError
 from popgen.methods.recipe import SourcedSetting
@@ -121,11 +122,14 @@ def compose_sources(overrides: Sequence[str], config_dir: str | None = None) -> 
     from popgen.config.run_config import schema_of, unknown_field
     from popgen.methods.registry import DEFAULT_RECIPE, METHODS
 
-    folder = None if config_dir is None else _preset_folder(config_dir)
+    folder = None if config_dir is None else find_preset_folder(config_dir)
+    check_presets(overrides, folder)
     translated = choose_custom_layout([_translate(override) for override in overrides])
     chosen = _choose_groups(translated, overrides, folder)
     schema = schema_of(chosen)
     recipes = METHODS[chosen["method"]].recipes
+    if "scale" not in chosen:
+        raise UserError("scale", "the preset does not say what it stands on", "add a line such as scale: laptop")
     if not isinstance(chosen["scale"], str):
         raise UserError("scale", "the preset sets a section `scale`", "begin its file with: # @package _global_")
     if (name := chosen["scale"]) not in recipes and name not in _list_own_scales(folder):
@@ -184,7 +188,8 @@ def choose_method(overrides: Sequence[str], config_dir: str | None = None) -> st
     Raises:
         UserError: an override that cannot be read, an unknown option.
     """
-    folder = None if config_dir is None else _preset_folder(config_dir)
+    folder = None if config_dir is None else find_preset_folder(config_dir)
+    check_presets(overrides, folder)
     return str(_choose_groups([_translate(override) for override in overrides], overrides, folder)["method"])
 
 
@@ -256,18 +261,6 @@ def compose_record(record: Mapping[str, Any], overrides: Sequence[str]) -> dict[
     return {str(key): value for key, value in values.items()}
 
 
-def _preset_folder(path: str) -> Path:
-    """A user's folder of groups.
-
-    Raises:
-        UserError: there is none.
-    """
-    folder = Path(path).absolute()
-    if not folder.is_dir():
-        raise UserError("--config-dir", f"{path} is no folder", "give one with groups such as scale/NAME.yaml")
-    return folder
-
-
 def _choose_groups(translated: list[str], overrides: Sequence[str], folder: Path | None) -> dict[str, Any]:
     """Method, scale and environment, which the rest stands on."""
     keys = {word: word.lstrip("+").partition("=")[0] for word in translated}
@@ -289,6 +282,7 @@ def _compose(
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import MarkedYAMLError
 
     try:
         groups, fields = _split_fields(translated)
@@ -297,6 +291,8 @@ def _compose(
         values = OmegaConf.to_container(config, resolve=not loose)
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # the last for a number as a group's option
         raise _composition_error(error, overrides, folder, unknown) from None
+    except MarkedYAMLError as error:
+        raise describe_yaml_error(error) from None
     assert isinstance(values, dict)
     for key in [] if loose else sorted(_unset(values)):
         raise UserError(key, "has no value", f"give one with {key}=VALUE")

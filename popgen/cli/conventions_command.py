@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import add_command, at_least, named_path, positive
-from popgen.cli.printing import OK, print_json, print_report
+from popgen.cli.output_places import check_report_folder
+from popgen.cli.printing import OK, print_json, print_report, tell_unfinished
 from popgen.cli.training import bound_threads
 
 PEOPLE = "people"
@@ -53,6 +54,8 @@ def analyse(args: argparse.Namespace) -> int:
         write_conventions,
     )
 
+    check_report_folder(Path(args.out), quiet=args.quiet)
+    tell_unfinished(path for _, path in args.populations)
     populations = [(name or path, load_population(path)) for name, path in args.populations]
     reports = _report_players(args, populations)
     files = write_conventions(reports, Path(args.out))

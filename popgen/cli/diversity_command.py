@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import add_command, add_response_options, at_least, named_path, share_of_one
-from popgen.cli.printing import OK, print_json, print_report
+from popgen.cli.output_places import check_report_folder
+from popgen.cli.printing import OK, print_json, print_report, tell_unfinished
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
 
@@ -59,14 +60,14 @@ def measure(args: argparse.Namespace) -> int:
         write_report,
     )
     from popgen.reports.method_titles import title_of
-    from popgen.runs.preflight import check_root
 
+    tell_unfinished(path for _, path in args.populations)
     opened = open_sides({"partner": args.populations}, title_of)
     groups = opened.sides["partner"]
     players = [player for group in groups for player in group.players]
     if args.choose is not None and args.choose > len(players):
         raise UserError("--choose", f"is {args.choose}, there are {len(players)} partners", "choose fewer")
-    check_root(Path(args.out), 16 * 2**20, "--out")
+    check_report_folder(Path(args.out), quiet=args.quiet)
     environment, training = opened.environment, ResponseTraining.of_words(args.response_set)
     found = find_responses(groups, args.responses, training, environment)
     responses = [found[player.identity or ""].player for player in players if (player.identity or "") in found]
@@ -89,7 +90,7 @@ def measure(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**report, "files": {name: str(path) for name, path in files.items()}})
         return OK
-    print_report(list_sheets(report), list_lines(report), args.out, files, width=110)
+    print_report(list_sheets(report), list_lines(report), args.out, files, width=80)
     for command in list_commands(report):
         print(f"to hold these out: {command}")
     return OK

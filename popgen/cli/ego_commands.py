@@ -8,6 +8,7 @@ from typing import Any
 
 from popgen.cli.arguments import Parser, add_command, add_config_dir
 from popgen.cli.compose import compose
+from popgen.cli.printing import tell_unfinished
 from popgen.cli.run_command import execute
 from popgen.cli.training import bound_threads
 
@@ -56,6 +57,7 @@ def train_ego(args: argparse.Namespace) -> int:
     keys = [word.lstrip("+").partition("=")[0] for word in overrides]
     method = dict(word.partition("=")[::2] for word in overrides).get("method", DEFAULT_EGO)
     overrides = [*(word for word in overrides if not word.startswith("method=")), f"method={find_ego_method(method)}"]
+    tell_unfinished(partners)
     info = environment_of(partners) if partners else None
     if info is not None and not any(key == "env" or key.startswith("env.") for key in keys):
         values = compose([*overrides, f"env.name={info.name}"], args.config_dir)

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_response_options, at_least, named_path, numbers, pair
-from popgen.cli.printing import OK, print_json, print_report
+from popgen.cli.output_places import check_report_folder
+from popgen.cli.printing import OK, print_json, print_report, tell_unfinished
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
 
@@ -61,7 +62,7 @@ def _add_players(parser: argparse.ArgumentParser) -> None:
         metavar=_NAMED,
         nargs="+",
         type=named_path,
-        help="population or its run; with --with also PATH:1,3 for some members, module:Agent, and one NAME for "
+        help="population or its run, PATH:1,3 for some members; with --with also module:Agent, and one NAME for "
         "several seeds of an ego",
     )
     partners = "hold-out partners: populations, PATH:1,3 for some members only, or agents as module:Agent"
@@ -84,6 +85,9 @@ def evaluate(args: argparse.Namespace) -> int:
             raise UserError(option, f"is of an evaluation {without} --with", "leave it out")
     if args.response_set and not args.best_responses:
         raise UserError("--response-set", "is of best responses, and none are trained", "add --best-responses")
+    tell_unfinished(
+        path for name in ("populations", "partners", "human", "met") for _, path in getattr(args, name) or []
+    )
     if together:
         return _evaluate_egos(args)
     if len(args.populations) > 1:
@@ -93,9 +97,12 @@ def evaluate(args: argparse.Namespace) -> int:
 
 def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
     from popgen.population import check_compatible, load_population
+    from popgen.population.chosen_members import split_members
     from popgen.progress import make_reporter
-    from popgen.runs.preflight import check_root
 
+    path, chosen = split_members(path)
+    if chosen and args.members:
+        raise UserError("--members", f"are named by {path}:... too", "leave one of them out")
     population = load_population(path)
     if args.env or args.param:
         from popgen.envs import make_env
@@ -105,7 +112,7 @@ def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
         params = {**(info.params if name == info.name else {}), **dict(args.param)}
         check_compatible(population, make_env(name, 1, **params).spec)
     out = Path(args.out) if args.out else population.path / "evaluation"
-    check_root(out, 16 * 2**20, "--out")
+    check_report_folder(out, quiet=args.quiet)
     from popgen.evaluation.crossplay import evaluate_population
     from popgen.reports.crossplay_report import matrix_sheet, mixed_play_sheet, summary, to_dict, write_report
 
@@ -115,7 +122,7 @@ def _evaluate_matrix(args: argparse.Namespace, path: str) -> int:
             population,
             args.episodes or MATRIX_EPISODES,
             args.seed,
-            args.members,
+            list(chosen) or args.members,
             progress=lambda done, total: reporter.update(done / total, episodes=done),
         )
     files, report = write_report(result, out), to_dict(result)
@@ -138,11 +145,10 @@ def _evaluate_egos(args: argparse.Namespace) -> int:
     from popgen.progress import make_reporter
     from popgen.reports.holdout_report import to_dict, write_report
     from popgen.reports.holdout_tables import list_lines, to_sheets
-    from popgen.runs.preflight import check_root
 
     casting, environment = _cast_players(args)
     out = Path(args.out or "holdout")
-    check_root(out, 64 * 2**20, "--out")
+    check_report_folder(out, 64 * 2**20, quiet=args.quiet)
     with closing(make_reporter(quiet=args.quiet)) as reporter:
         casting = _train_responses(casting, environment, args, reporter)
         reporter.phase("evaluation", 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import Parser, add_command, at_least
+from popgen.cli.output_places import check_report_folder
 from popgen.cli.printing import OK, print_json
 from popgen.cli.training import bound_threads
 
@@ -49,12 +50,11 @@ def fit_humans(args: argparse.Namespace) -> int:
     from popgen.humans.proxies import HALVES, fit_population
     from popgen.humans.recordings import LAYOUTS, load_games, make_human_env
     from popgen.progress import make_reporter
-    from popgen.runs.preflight import check_root
 
     layouts, halves = args.layout or list(LAYOUTS), args.half or list(HALVES)
     for layout in layouts:
         make_human_env(layout)
-    check_root(Path(args.out), 2**24, "--out")
+    check_report_folder(Path(args.out), quiet=True)
     began, written = time.perf_counter(), []
     games = load_games([HALVES[half] for half in halves], layouts)
     with closing(make_reporter(quiet=args.quiet)) as reporter:

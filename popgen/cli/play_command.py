@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli import report_command
 from popgen.cli.arguments import add_command, at_least
-from popgen.cli.printing import OK, print_json
+from popgen.cli.output_places import check_written_file
+from popgen.cli.printing import OK, print_json, tell_unfinished
 from popgen.cli.training import bound_threads
 from popgen.errors import UserError
 
@@ -48,9 +49,12 @@ def add(commands: Any) -> None:
 
 def play(args: argparse.Namespace) -> int:
     """Serve games, or play one and write it."""
+    check_written_file(args.html, "--html", ".html")
+    check_written_file(args.gif, "--gif", ".gif")
     bound_threads(1)
     from popgen.population import load_population
 
+    tell_unfinished([args.population])
     population = load_population(args.population)
     if args.watch or args.html or args.gif:
         return _watch_members(args, population)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import add_command
-from popgen.cli.printing import OK, print_json, print_table
+from popgen.cli.printing import OK, print_json, print_sheet, print_table, tell_unfinished
 
 
 def add(commands: Any) -> None:
@@ -38,13 +38,17 @@ def add(commands: Any) -> None:
 def show(args: argparse.Namespace) -> int:
     """Tell what a population holds."""
     from popgen.population import load_population
-    from popgen.reports.population_report import describe_population, render_population
+    from popgen.reports.population_report import describe_population, make_members_sheet, render_population
 
+    tell_unfinished([args.population])
     population = load_population(args.population)
+    report = describe_population(population)
     if args.json:
-        print_json(describe_population(population))
+        print_json(report)
         return OK
-    print_table(render_population(population))
+    print_table(render_population(report, population))
+    print()
+    print_sheet(make_members_sheet(report, population))
     print(f"population: {population.path}")
     return OK
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
@@ -46,8 +47,9 @@ def _open_console(width: int | None) -> Console:
 
 def print_sheet(sheet: Sheet, width: int | None = None) -> None:
     """As one table, or as several below each other where its figures would be cut."""
-    for part in sheet.split(_open_console(width).width):
-        print_table(part.to_rich(), width)
+    room = _open_console(width).width
+    for part in sheet.split(room):
+        print_table(part.to_rich(room), width)
 
 
 def print_report(
@@ -63,3 +65,22 @@ def print_report(
             print_sheet(table, width)
     told = [part for line in lines for part in (wrap(line, width) if width else [line])]
     print("\n".join([*told, f"report: {out} ({', '.join(files)})"]))
+
+
+def tell_unfinished(populations: Iterable[str]) -> None:
+    """A note for each population whose run has not finished: what is said of it is said of the members so far.
+
+    Args:
+        populations: PATH or PATH:1,3; what is no folder is passed over.
+    """
+    from popgen.population.chosen_members import split_members
+    from popgen.runs.directory import describe_unfinished
+
+    paths = dict.fromkeys(Path(split_members(text)[0]) for text in populations)
+    tell_notes(told for path in paths if (told := describe_unfinished(path)) is not None)
+
+
+def tell_notes(notes: Iterable[str]) -> None:
+    """Lines for the user on stderr, which stay beside results on stdout."""
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)

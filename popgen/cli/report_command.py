@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from popgen.cli.arguments import add_command, at_least
-from popgen.cli.printing import OK, print_json
+from popgen.cli.output_places import check_written_file
+from popgen.cli.printing import OK, print_json, tell_unfinished
 from popgen.cli.training import bound_threads
 
 
@@ -32,7 +33,9 @@ def add(commands: Any) -> None:
 
 def report(args: argparse.Namespace) -> int:
     """Write the page."""
+    check_written_file(args.out, "--out", ".html")
     bound_threads(1)
+    tell_unfinished([args.path])
     from popgen.pages.report_source import read_source
     from popgen.pages.run_report import list_findings, write_run_report
     from popgen.progress import make_reporter

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir, at_least, expand_home
 from popgen.cli.compose import compose
+from popgen.cli.output_places import check_report_folder, check_written_file
 from popgen.cli.printing import OK, print_json, print_sheet
 from popgen.cli.training import before_ray
 from popgen.errors import UserError
@@ -71,6 +72,7 @@ def reproduce(args: argparse.Namespace) -> int:
     """List, render, or make what is missing and print where things stand."""
     if args.list:
         return _list_targets(args)
+    check_written_file(args.results, "--results", ".md")
     if args.results is not None and args.target is None:
         return _write_page(Path(args.results))
     if args.target is None:
@@ -101,11 +103,13 @@ def _plan_pieces(args: argparse.Namespace) -> Pieces:
     from popgen.pipelines.reproduction_pieces import Pieces, Plan
     from popgen.reports.reproduction.results_page import read_records
     from popgen.reports.reproduction.target_registry import find_targets
-    from popgen.runs.preflight import check_root
 
     budget = find_budget(args.budget, args.layouts)
     targets, out = find_targets(args.target), Path(args.out)
-    check_root(out, 256 * 2**20, "--out")
+    for folder in args.runs:
+        if not Path(folder).is_dir():
+            raise UserError("--runs", f"{folder} is no folder", "name one that holds finished runs")
+    check_report_folder(out, 256 * 2**20, quiet=True)
     seeds = list(dict.fromkeys(args.seeds or budget.seeds))
     words = ["popgen", "reproduce", args.target, *args.overrides, "--budget", budget.name, "--seeds", *map(str, seeds)]
     words += ["--layouts", *args.layouts] if args.layouts else []

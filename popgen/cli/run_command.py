@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, compose_record, to_yaml
-from popgen.cli.printing import OK, WEAK, print_json, print_sheet
+from popgen.cli.printing import OK, WEAK, print_json, print_sheet, tell_notes
 from popgen.cli.standard_streams import keep_native_lines
-from popgen.cli.training import before_ray, tell_notes
+from popgen.cli.training import before_ray
 from popgen.durable_files import read_regular
 from popgen.errors import UserError
 
@@ -115,7 +115,22 @@ def read_record(run: str) -> dict[str, Any]:
         raise UserError("--from", problem, "give a run's folder") from None
     if not isinstance(values, dict):
         raise UserError("--from", f"{path} holds no settings", "give a run's folder")
-    return values
+    return _keep_kitchen(values, Path(run))
+
+
+def _keep_kitchen(values: dict[str, Any], run: Path) -> dict[str, Any]:
+    """The settings, with the grid that the run's population was trained in for the path of a layout file.
+
+    The file may have been edited or moved since. A run that has no manifest yet keeps the path.
+    """
+    env = values.get("env")
+    if not (isinstance(env, dict) and str(env.get("name")).endswith(".layout")):
+        return values
+    try:
+        trained = json.loads(read_regular(run / "population" / "manifest.json"))["environment"]
+        return {**values, "env": {"name": trained["name"], "params": trained["params"]}}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return values
 
 
 def native_lines(folder: Path) -> Path:

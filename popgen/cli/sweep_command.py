@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir, at_least
 from popgen.cli.compose import SweepAxis, parse_axis
-from popgen.cli.printing import OK, print_json, print_report
-from popgen.cli.training import leave_out_foreign, runs_to_start, tell_notes
+from popgen.cli.printing import OK, print_json, print_report, tell_notes
+from popgen.cli.training import leave_out_foreign, runs_to_start
 from popgen.errors import UserError
 
 if TYPE_CHECKING:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import secrets
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from popgen.cli.compose import choose_method, compose
+from popgen.cli.output_places import check_report_folder
+from popgen.cli.printing import tell_notes
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
@@ -35,12 +37,6 @@ def before_ray(threads: int, local: bool) -> None:
     bound_threads(threads)
 
 
-def tell_notes(notes: Iterable[str]) -> None:
-    """Lines for the user on stderr, which stay beside results on stdout."""
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
-
-
 def runs_to_start(
     overrides: Sequence[Sequence[str]],
     out: str,
@@ -64,7 +60,7 @@ def runs_to_start(
         UserError: what cannot work.
     """
     from popgen.config.run_config import RunConfig
-    from popgen.runs.preflight import check_root, preflight
+    from popgen.runs.preflight import preflight
 
     notes: dict[str, None] = {}
     kept = leave_out_foreign(overrides, shared, config_dir, notes)
@@ -77,7 +73,7 @@ def runs_to_start(
     check_different(configs)
     for config in configs:
         notes |= dict.fromkeys(f"{config.env.name}: {note}" for note in preflight(config).notes)
-    check_root(Path(out), 16 * 2**20, "--out")
+    check_report_folder(Path(out), quiet=quiet)
     if not quiet:
         tell_notes(notes)
     return configs

@@ -125,13 +125,21 @@ class Sheet:
         title = self.title if first else f"{self.title} (continued)"
         return replace(self, title=title, frame=self.frame.iloc[:, kept], bold=bold)
 
-    def to_rich(self) -> Table:
-        """For the terminal."""
+    def to_rich(self, width: int | None = None) -> Table:
+        """For the terminal; where it is tight at so many characters, columns without sentences are no wider than they
+        must be, which rich does not find by itself."""
         table = Table(title=Text(self.title))
+        longest = [
+            max([len(str(label)), *self.frame.iloc[:, number].astype(str).map(len)])
+            for number, label in enumerate(self.frame.columns)
+        ]
+        is_tight = width is not None and 1 + sum(size + len("|  ") for size in longest) > width
         for number, label in enumerate(self.frame.columns):
-            is_label = number < self.labels
+            is_label, least = number < self.labels, self._measure_column(number)
             sides = {"justify": "left" if is_label else "right", "no_wrap": is_label}
-            table.add_column(Text(str(label)), min_width=self._measure_column(number), **sides)
+            has_sentences = self.frame.iloc[:, number].astype(str).map(len).max() > least
+            fixed = least if is_tight and not has_sentences else None
+            table.add_column(Text(str(label)), min_width=least, width=fixed, **sides)
         for row, cells in enumerate(self.frame.to_numpy()):
             texts = [Text(str(cell), "bold" if (row, column) in self.bold else "") for column, cell in enumerate(cells)]
             table.add_row(*texts, style="dim" if row in self.dim else None)

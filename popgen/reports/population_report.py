@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
-from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -53,9 +52,8 @@ def list_kinds(population: Population) -> list[str]:
     return [str(kind) for kind in Kind if str(kind) in used]
 
 
-def render_population(population: Population) -> Group:
-    """The account as text for the terminal; print it with a rich console."""
-    report = describe_population(population)
+def render_population(report: Mapping[str, Any], population: Population) -> Table:
+    """What an account says of the whole population, for the terminal; print it with a rich console."""
     info, manifest = population.env_info, population.manifest
     params = ", ".join(f"{name}={value}" for name, value in info.params.items() if name != "grid")
     size, steps = report["bytes"] / 2**20, report["total_steps"]
@@ -70,11 +68,12 @@ def render_population(population: Population) -> Group:
     grid = Table.grid(padding=(0, 2))
     for name, value in facts.items():
         grid.add_row(name, Text(value))
-    return Group(grid, "", _members_sheet(report, find_mates(population.members)).to_rich())
+    return grid
 
 
-def _members_sheet(report: Mapping[str, Any], mates: Sequence[int]) -> Sheet:
+def make_members_sheet(report: Mapping[str, Any], population: Population) -> Sheet:
     """A row for each member; of one that was trained in a pair its role and its mate, with which it plays its SP."""
+    mates = find_mates(population.members)
     pairs = {member["id"]: mate for member, mate in zip(report["members"], mates, strict=True) if mate != member["id"]}
     frame = pd.DataFrame(
         [
@@ -91,7 +90,7 @@ def _members_sheet(report: Mapping[str, Any], mates: Sequence[int]) -> Sheet:
             for member in report["members"]
         ]
     )
-    return Sheet("", frame, labels=3 if pairs else 2)
+    return Sheet("members", frame, labels=3 if pairs else 2)
 
 
 def _name_mate(member: Mapping[str, Any], pairs: Mapping[int, int]) -> str:

@@ -193,6 +193,26 @@ def describe_run(folder: Path) -> dict[str, Any]:
     return known | {"total_steps": sum(known["steps"].get(str(kind), 0) for kind in TRAINING_KINDS)}
 
 
+def describe_unfinished(population: Path) -> str | None:
+    """What is still to come of a population, by its folder or its run's; None where nothing is, or it lies in no run.
+
+    Returns:
+        Such as "runs/night is interrupted: 2 of 8 members are there".
+    """
+    folder = population.resolve()
+    folder = folder.parent if folder.name == "population" else folder
+    if not (folder / "config.json").is_file():
+        return None
+    run = describe_run(folder)
+    if run["state"] == "finished":
+        return None
+    try:
+        members = len(json.loads(read_regular(folder / "population" / "manifest.json"))["members"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None  # whoever loads it is told
+    return f"{_strip_controls(str(population))} is {run['state']}: {members} of {run['size']} members are there"
+
+
 def describe_end(error: BaseException) -> str:
     """What ended a run, in one line of plain text: Ray's errors bring colours and the tracebacks of other processes."""
     if (interruption := describe_interruption(error)) is not None:

@@ -103,3 +103,21 @@ def test_a_preset_that_is_no_whole_configuration_is_told(run: Run, tmp_path: Pat
     (tmp_path / "scale" / "mine.yaml").write_text("phase1: {target_score: 5}\n")  # without its first line
     code, _, err = run("run", "scale=mine", "--config-dir", str(tmp_path), "--dry-run")
     assert code == 2 and "begin its file with: # @package _global_" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"# @package _global_\nagent: [\n", "is no YAML (line 3"),
+        (b"\xff\xfe\x00\x93", "cannot be read"),
+        (b"# @package _global_\n- 1\n", "holds no settings"),
+        (b"# @package _global_\nphase1: {target_score: 5}\n", "add a line such as scale: laptop"),
+        (b"# @package _global_\ndefaults: [other]\n", "other.yaml is no YAML (line 1"),
+    ],
+)
+def test_a_preset_that_cannot_be_read_is_one_line(run: Run, tmp_path: Path, content: bytes, told: str) -> None:
+    (tmp_path / "scale").mkdir()
+    (tmp_path / "scale" / "mine.yaml").write_bytes(content)
+    (tmp_path / "scale" / "other.yaml").write_text("a: }")
+    code, out, err = run("run", "scale=mine", "--config-dir", str(tmp_path), "--dry-run")
+    assert code == 2 and out == "" and told in err and err.count("\n") == 1, err

@@ -12,7 +12,9 @@ from popgen.cli.compose import SweepAxis, compose, compose_record, parse_axis
 from popgen.cli.sweep_command import draw_points, list_runs
 from popgen.cli.training import leave_out_foreign
 from popgen.config.run_config import RunConfig
+from popgen.envs import make_env
 from popgen.errors import UserError
+from popgen.population.manifest import EnvironmentInfo
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -90,6 +92,26 @@ def test_a_run_is_repeated_from_its_record(run: Run, tmp_path: Path) -> None:
     assert (changed.run.seed, changed.ppo.units, changed.tracking.enabled) == (4, 64, False)
     assert changed.env.params == {**first.env.params, "horizon": 20}
     assert changed.diversity == first.diversity
+
+
+def test_a_run_in_a_layout_file_is_repeated_in_its_own_kitchen(run: Run, tmp_path: Path) -> None:
+    file, folder = tmp_path / "mine.layout", tmp_path / "first"
+    file.write_text('{"grid": "XXPXX/O1 2O/X   X/XDXSX", "cook_time": 7}'.replace("/", "\\n"))
+    settings = ["method=lipo", f"env.name=overcooked/{file}", "env.params.events=raw"]
+    config = RunConfig.parse(compose(settings))
+    trained = EnvironmentInfo.of(make_env(config.env.name, 1, seed=0, **config.env.params).spec)
+    (folder / "population").mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(config.as_dict()))
+    (folder / "population" / "manifest.json").write_text(json.dumps({"environment": trained.model_dump()}))
+    file.unlink()
+    code, out, err = run("run", "--from", str(folder), "--dry-run", "--json", "env.params.horizon=50")
+    assert code == 0, err
+    env = json.loads(out)["env"]
+    again = make_env(env["name"], 1, seed=0, **{**env["params"], "horizon": trained.horizon}).spec
+    assert again.fingerprint == trained.fingerprint and env["params"]["horizon"] == 50
+    (folder / "population" / "manifest.json").unlink()
+    code, _, err = run("run", "--from", str(folder), "--dry-run")
+    assert code == 2 and "there is no file" in err and str(file) in err
 
 
 @pytest.mark.parametrize("word", ["scale=paper", "method=mappo", "env=overcooked/cramped_room", "agent.units=3", "x"])

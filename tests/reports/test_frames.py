@@ -45,3 +45,12 @@ def test_no_figure_is_cut(width: int, capsys: pytest.CaptureFixture[str]) -> Non
     shown = capsys.readouterr().out
     assert "…" not in shown and all(cell in shown for cell in FRAME.iloc[:, 1:].to_numpy().ravel())
     assert max(map(len, shown.splitlines())) <= width
+
+
+def test_a_table_that_just_fits_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    """Widths 9, 14, 7, 13, 6 and three of 10, and the last line: 80. Rich alone cuts it at its last column."""
+    cells = ["1", "world_model", "1001", "433,414", "3.3", "400,000", "473,600", "873,600"]
+    columns = ["member", "policy", "seed", "parameters", "MiB", "random steps", "SP steps", "all steps"]
+    print_sheet(Sheet("members", pd.DataFrame([cells], columns=columns), labels=2), 80)
+    lines = capsys.readouterr().out.splitlines()
+    assert {len(line.rstrip()) for line in lines[1:]} == {80} and all(cell in lines[-2] for cell in cells)

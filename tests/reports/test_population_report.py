@@ -10,8 +10,8 @@ from rich.console import Console
 from popgen.envs import make_env
 from popgen.policies.feed_forward_policy import FeedForwardPolicy
 from popgen.policies.simple_policies import RandomPolicy
-from popgen.population import PopulationWriter, load_population
-from popgen.reports.population_report import describe_population, render_population
+from popgen.population import Population, PopulationWriter, load_population
+from popgen.reports.population_report import describe_population, make_members_sheet, render_population
 
 
 def make(path: Path) -> Path:
@@ -36,12 +36,24 @@ def test_describe_adds_up(tmp_path: Path) -> None:
     assert report["manifest"]["method"] == "xpm_wm" and report["path"] == str(tmp_path)
 
 
+def shown(population: Population) -> str:
+    """What `popgen show` prints on a terminal of 80 columns."""
+    text, report = io.StringIO(), describe_population(population)
+    console = Console(file=text, width=80)
+    for part in (
+        render_population(report, population),
+        *(sheet.to_rich(80) for sheet in make_members_sheet(report, population).split(80)),
+    ):
+        console.print(part)
+    return text.getvalue()
+
+
 def test_render_says_what_is_there(tmp_path: Path) -> None:
-    text = io.StringIO()
-    Console(file=text, width=120).print(render_population(load_population(make(tmp_path))))
+    text = shown(load_population(make(tmp_path)))
+    assert max(map(len, text.splitlines())) <= 80
     for part in ("rendezvous/mppmr", "xpm_wm, seed 3, config abcdef012345", "1,214 environment steps", "feed_forward",
-                 "1,200", "SP steps", "XP steps", "random steps", "popgen 0."):  # fmt: skip
-        assert part in text.getvalue(), part
+                 "1,000", "1,200", "members (continued)", "popgen 0."):  # fmt: skip
+        assert part in text, part
 
 
 def test_the_mates_of_pairs_are_named(tmp_path: Path) -> None:
@@ -49,9 +61,8 @@ def test_the_mates_of_pairs_are_named(tmp_path: Path) -> None:
     writer = PopulationWriter(tmp_path, spec, method="hsp", config_digest="d", seed=0)
     for role, pair in (("biased", 3), ("partner", 3), ("biased", 12)):
         writer.add_member(RandomPolicy(5), seed=1, steps={"SP": 1}, extra={"role": role, "pair": pair})
-    text = io.StringIO()
-    Console(file=text, width=100).print(render_population(load_population(tmp_path)))
-    assert "biased, mate 2" in text.getvalue() and "partner, mate 1" in text.getvalue()
+    text = shown(load_population(tmp_path))
+    assert "biased, mate 2" in text and "partner, mate 1" in text
 
 
 def test_an_empty_population_can_be_shown(tmp_path: Path) -> None:
@@ -59,6 +70,4 @@ def test_an_empty_population_can_be_shown(tmp_path: Path) -> None:
     PopulationWriter(tmp_path, spec, method="xpm_wm", config_digest="d", seed=0)
     population = load_population(tmp_path)
     assert describe_population(population)["members"] == [] and describe_population(population)["total_steps"] == 0
-    text = io.StringIO()
-    Console(file=text, width=100).print(render_population(population))
-    assert "0 environment steps" in text.getvalue()
+    assert "0 environment steps" in shown(population)

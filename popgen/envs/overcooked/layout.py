@@ -149,6 +149,8 @@ def _from_file(layout: str) -> Layout:
     if layout == CUSTOM and not path.is_file():
         fix = "give rows separated by '/', or a file by env.name=overcooked/PATH.layout"
         raise UserError("env.grid", f"is missing: {CUSTOM!r} is no layout, but a grid of your own", fix)
+    if not named and path.suffix == ".layout" and not path.is_file():
+        raise UserError("env.layout", f"there is no file {path}", "give the path of a .layout file")
     if path.suffix != ".layout" or not path.is_file():
         close = difflib.get_close_matches(path.stem, layout_names(), 3) if named else []
         fix = f"did you mean {' or '.join(close)}?" if close else "give a layout of overcooked_ai or a .layout file"
