@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
 
 ALIASES = {"seed": "run.seed"}
-OPEN_SECTIONS = ("env.params", "cluster.resources", "discovery.event_factors")  # dictionaries that take any key
+OPEN_SECTIONS = ("env.params", "cluster.resources", "discovery.event_factors", "discovery.scaffolds")
+"""Dictionaries that take any key."""
 
 
 QUOTES = "'\""

@@ -12,6 +12,7 @@ from typing import Any
 
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import Composed, compose_sources
+from popgen.cli.preset_files import find_preset_folder
 from popgen.cli.printing import OK, print_json
 from popgen.errors import UserError
 from popgen.methods.recipe import Setting, SourcedSetting
@@ -56,11 +57,13 @@ def add(commands: Any) -> None:
         "METHOD stands for method=METHOD; overrides are those of `popgen run`, so that the table shows what the same "
         "words would start. A value comes from the schema (its default), the recipe (scale=), the recipe's row of the "
         "layout (env=), a preset file, or the command line; each of these wins over those before it. Keys of --json: "
-        "method, scale, env, fields (name, value, default, range, meaning, source, reason, ours).",
+        "method, scale, env, fields (name, value, default, range, meaning, source, reason, ours); with --list methods "
+        "and presets.",
     )
     parser.add_argument("overrides", nargs="*", metavar="[METHOD] [KEY=VALUE]", help="of which run")
     parser.add_argument("--changed", action="store_true", help="only values that are not the schema's defaults")
     parser.add_argument("--section", default=None, metavar="NAME", help="only this one, such as agent or phase1")
+    parser.add_argument("--list", action="store_true", help="the methods and presets that there are, and no table")
     add_config_dir(parser)
 
 
@@ -68,6 +71,8 @@ def show_config(args: argparse.Namespace) -> int:
     """Print the table, or the same as JSON."""
     from popgen.config.run_config import RunConfig
 
+    if args.list:
+        return _list_choices(args)
     words = list(args.overrides)
     if words and "=" not in words[0] and not words[0].startswith("~"):
         words[0] = f"method={words[0]}"
@@ -81,6 +86,17 @@ def show_config(args: argparse.Namespace) -> int:
         print_json({**head, "fields": [asdict(row) for row in rows]})
     else:
         _print_rows(rows, ", ".join(f"{name}={value}" for name, value in head.items()))
+    return OK
+
+
+def _list_choices(args: argparse.Namespace) -> int:
+    from popgen.cli.setting_choices import describe_choices, list_choices
+
+    choices = list_choices(None if args.config_dir is None else find_preset_folder(args.config_dir))
+    if args.json:
+        print_json(choices)
+    else:
+        print("\n".join(describe_choices(choices, 80)))
     return OK
 
 

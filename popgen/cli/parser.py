@@ -66,7 +66,11 @@ def _expand_word(word: str) -> str:
 @cache
 def _parser() -> argparse.ArgumentParser:
     """Built once in a process: it takes 20 milliseconds."""
-    parser = Parser(prog="popgen", description="Populations of diverse cooperative partner agents.")
+    parser = Parser(
+        prog="popgen",
+        description="Populations of diverse cooperative partner agents.",
+        epilog="Methods, recipes and environments: popgen config --list.",
+    )
     parser.add_argument("--version", action="version", version=f"popgen {popgen.__version__}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 OK, ERROR, WEAK, INTERRUPTED = 0, 2, 3, 130
 
+WIDTH = 80
+"""Columns of a plain terminal, which sentences are wrapped at."""
+
 
 def short(text: str, length: int = 100) -> str:
     """The text, cut to `length` characters."""
@@ -55,7 +58,14 @@ def print_sheet(sheet: Sheet, width: int | None = None) -> None:
 def print_report(
     tables: Iterable[Sheet | Table], lines: Iterable[str], out: str, files: Iterable[str], width: int | None = None
 ) -> None:
-    """Tables, sentences, and where the report's files are."""
+    """Tables, sentences of WIDTH columns, and where the report's files are.
+
+    Args:
+        tables: `width` columns wide, by default as wide as the terminal.
+        lines: sentences.
+        out: folder of the report.
+        files: their names.
+    """
     from rich.table import Table
 
     for table in tables:
@@ -63,8 +73,13 @@ def print_report(
             print_table(table, width)
         else:
             print_sheet(table, width)
-    told = [part for line in lines for part in (wrap(line, width) if width else [line])]
-    print("\n".join([*told, f"report: {out} ({', '.join(files)})"]))
+    told = [*lines, f"report: {out} ({', '.join(files)})"]
+    print("\n".join(part for line in told for part in wrap_line(line)))
+
+
+def wrap_line(line: str) -> list[str]:
+    """A sentence as lines of at most WIDTH columns; paths and options stay whole."""
+    return wrap(line, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def tell_unfinished(populations: Iterable[str]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import compose, compose_record, to_yaml
-from popgen.cli.printing import OK, WEAK, print_json, print_sheet, tell_notes
+from popgen.cli.printing import OK, WEAK, WIDTH, print_json, print_sheet, tell_notes, wrap_line
 from popgen.cli.standard_streams import keep_native_lines
 from popgen.cli.training import before_ray
 from popgen.durable_files import read_regular
@@ -20,9 +20,6 @@ from popgen.errors import UserError
 
 if TYPE_CHECKING:
     from popgen.config.run_config import RunConfig
-
-WIDTH = 80
-"""Columns of the last screen."""
 
 
 def add(commands: Any) -> None:
@@ -157,7 +154,7 @@ def _print_run(result: Mapping[str, Any]) -> None:
 
     evaluation = result["evaluation"]
     print_sheet(matrix_sheet(evaluation, narrow=True))
-    print("\n".join(summary(evaluation)))
+    print("\n".join(part for line in summary(evaluation) for part in wrap_line(line)))
     if findings := result.get("findings"):
         print("\nwhat it means")
         for finding in findings:

@@ -121,3 +121,15 @@ def test_a_preset_that_cannot_be_read_is_one_line(run: Run, tmp_path: Path, cont
     (tmp_path / "scale" / "other.yaml").write_text("a: }")
     code, out, err = run("run", "scale=mine", "--config-dir", str(tmp_path), "--dry-run")
     assert code == 2 and out == "" and told in err and err.count("\n") == 1, err
+
+
+def test_methods_and_presets_are_listed_as_words_that_run_takes(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "scale").mkdir()
+    (tmp_path / "scale" / "mine.yaml").write_text("# @package _global_\nscale: mine\n")
+    code, out, _ = run("config", "--list", "--json", "--config-dir", str(tmp_path))
+    found = json.loads(out)
+    assert code == 0 and set(found["methods"]) == set(METHODS)
+    assert all("mine" in one["scales"] and one["title"] and one["summary"] for one in found["methods"].values())
+    assert {"overcooked/cramped_room", "rendezvous/mppmr"} <= set(found["presets"]["env"])
+    code, out, _ = run("config", "--list")
+    assert code == 0 and "method=lipo\n" in out and max(map(len, out.splitlines())) <= 80

@@ -240,6 +240,10 @@ class ReplayConfig(Schema):
     """Steps that each of the buffers B_SP and B_XP holds (the paper's buffer size)."""
     event_fraction: Fraction = 0.4
     """Share of a model batch's windows that are drawn for an event in them, the kinds in turn."""
+    event_places: Annotated[bool, AddedLater] = False
+    """Draw these windows evenly over the places where the event happened (the own state, in a view's `own` entries, of
+    the player who caused it), not over its occurrences: a second pot that is seldom used is known as well as the first.
+    """
 
 
 class Phase1Config(Schema):
@@ -379,6 +383,12 @@ class DiscoveryConfig(Schema):
     event_factors: dict[str, Weight] = {}
     """By name, what the weights of events are multiplied with in imagination: pick-ups that pay as much as the steps
     which they are for are made for their own sake."""
+    scaffolds: Annotated[dict[str, str], AddedLater] = {}
+    """By name, an event -> the one that it is for. The nearer the real rate of that one comes to `scaffold_until`, the
+    less the first pays in imagination: paid in full for ever, it is made where nothing can follow from it."""
+    scaffold_until: Annotated[Weight, AddedLater] = 0.005
+    """Real events a step, of both players together, from which on what leads to them pays nothing; needs `trust`,
+    which takes the rates."""
 
 
 class WatchConfig(Schema):

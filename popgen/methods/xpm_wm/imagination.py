@@ -378,13 +378,24 @@ class Discovery:
         """Reward and continuation of imagined states; an event that has been seen too rarely pays and ends them."""
         events = model.event_probs(arrived).float()
         players = self.spec.num_players
-        weights = torch.as_tensor(np.tile(self.weights * self.shares, players), dtype=torch.float32)
+        worth = self.weights * self.shares * self.scaffold_shares()
+        weights = torch.as_tensor(np.tile(worth, players), dtype=torch.float32)
         keep = model.continuation(arrived).float()
         if self.config.rare_events and self.tally is not None:
             rare = np.tile(self.tally.events < self.config.rare_events, players)
             happened = (events > 0.5) & torch.as_tensor(rare, device=self.device)
             keep = torch.where(happened.any(-1), torch.zeros_like(keep), keep)
         return Paid((events * weights.to(self.device)).sum(-1), keep)
+
+    def scaffold_shares(self) -> np.ndarray:
+        """(E,) float64 within [0, 1]: what is left of the pay of events that only lead to others."""
+        shares, names, rates = np.ones(self.spec.num_events), self.spec.event_names, self.rates
+        if rates is None:
+            return shares
+        for name, goal in self.config.scaffolds.items():
+            reached = rates.real[names.index(goal)] / max(self.config.scaffold_until, 1e-12)
+            shares[names.index(name)] = max(0.0, 1.0 - reached)
+        return shares
 
     def bonus(self, model: WorldModel, arrived: Latent, scale: float) -> Float[Tensor, "*batch"]:
         """For each player `scale` / sqrt(1 + n), n the real visits of the state of its own that the model shows. A

@@ -111,7 +111,14 @@ def _check_discovery(config: WorldModelRun, spec: EnvSpec) -> None:
     if config.discovery.count_bonus and not (view.own and view.binary):
         problem = f"view {config.world_model.view!r} of {spec.name} does not tell a player's own state apart"
         raise UserError("discovery.count_bonus", problem, "set it to 0 or choose another view")
-    for name in config.discovery.event_factors:
+    if config.replay.event_places and not (view.own and view.binary):
+        problem = f"view {config.world_model.view!r} of {spec.name} does not tell a player's own state apart"
+        raise UserError("replay.event_places", problem, "leave it out or choose another view")
+    scaffolds = config.discovery.scaffolds
+    named = {"event_factors": [*config.discovery.event_factors], "scaffolds": [*scaffolds, *scaffolds.values()]}
+    for field, name in ((field, name) for field, names in named.items() for name in names):
         if name not in spec.event_names:
             problem = f"{spec.name} has no event {name!r}"
-            raise UserError("discovery.event_factors", problem, f"choose among {', '.join(spec.event_names)}")
+            raise UserError(f"discovery.{field}", problem, f"choose among {', '.join(spec.event_names)}")
+    if scaffolds and not config.discovery.trust:
+        raise UserError("discovery.scaffolds", "need the events' real rates", "set discovery.trust above 0, such as 2")

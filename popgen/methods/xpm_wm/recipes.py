@@ -85,6 +85,10 @@ LAPTOP = Recipe(
             "discovery.event_factors": because(
                 {"takes_ingredient": 0.2, "takes_dish": 0.2}, "counters are near: pick-ups alone would be farmed"
             ),
+            "discovery.scaffolds": because(
+                {"takes_ingredient": "pots_ingredient", "takes_dish": "takes_soup"},
+                "with both pots full, onions would fill the hands that dishes need (docs/notes/learning.md, Scaffolds)",
+            ),
         },
     },
 )

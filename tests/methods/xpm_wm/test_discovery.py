@@ -82,6 +82,19 @@ def test_events_pay_by_factor_and_trust() -> None:
     assert torch.allclose(paid.reward, torch.full((3, 2), 0.2 + 0.5 * 3.0), atol=1e-5)
 
 
+def test_a_scaffold_pays_less_the_more_often_what_it_is_for_is_reached() -> None:
+    """With real rates 0.002 and 0.006 of the two goals and an end at 0.004: a half is left, and nothing."""
+    onion, dish, potted = SPEC.event_names[:3]
+    soup = SPEC.event_names[SOUP]
+    discovery = make(trust=1.0, scaffolds={onion: potted, dish: soup}, scaffold_until=0.004)
+    latent = random_latent(3, 2)
+    assert discovery.scaffold_shares().tolist() == [1.0] * 5  # no rates were taken yet
+    discovery.rates = Rates(np.zeros(5), np.array([0.1, 0.1, 0.002, 0.006, 0.0]))
+    assert discovery.scaffold_shares().tolist() == pytest.approx([0.5, 0.0, 1.0, 1.0, 1.0])
+    paid = discovery.pay(model_with_events(0, 1, SOUP), latent)
+    assert torch.allclose(paid.reward, torch.full((3, 2), 0.5 + 0.0 + 3.0), atol=1e-5)
+
+
 def test_a_rare_event_pays_and_ends() -> None:
     discovery, model, latent = make(rare_events=5), model_with_events(SOUP), random_latent(3, 2)
     for seen, ends in ((4, True), (5, False)):
