@@ -163,13 +163,23 @@ def _iter_partners(place: str, extra: Mapping[str, Any]) -> Iterator[Lineage]:
 def is_on_record(extra: Mapping[str, Any]) -> bool:
     """Whether a record that `read_partners` read says with whom a member was trained, if with nobody, and the same of
     those: partners that are egos must name theirs, clones their people."""
-    return TRAINED_WITH in extra and all(_tells_origin(one) for one in extra[TRAINED_WITH] or [])
+    return TRAINED_WITH in extra and all(
+        tells_origin(str(one["method"]), bool(one.get("people")), one) for one in extra[TRAINED_WITH] or []
+    )
 
 
-def _tells_origin(one: Mapping[str, Any]) -> bool:
-    method = METHODS.get(str(one["method"]))
-    generated = method is not None and not method.trains_ego
-    return generated or bool(one.get("people")) or is_on_record(one)
+def tells_origin(method: str, cloned: bool, extra: Mapping[str, Any]) -> bool:
+    """Whether it is known whom a member has met: one of a method that makes populations has met these alone, a clone
+    its people, and an ego what its record says.
+
+    Args:
+        method: of its population.
+        cloned: its record names people.
+        extra: the record.
+    """
+    known = METHODS.get(method)
+    generated = known is not None and not known.trains_ego
+    return generated or cloned or is_on_record(extra)
 
 
 def merge_records(members: Sequence[MemberInfo]) -> list[Any] | None:

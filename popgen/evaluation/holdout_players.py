@@ -18,8 +18,9 @@ from popgen.evaluation.holdout_lineages import (
     Lineage,
     describe_lineage,
     identify_member,
-    is_on_record,
     read_partners,
+    read_people,
+    tells_origin,
 )
 from popgen.evaluation.user_agents import is_agent_name, open_user_agent
 from popgen.play.policy import Policy
@@ -197,7 +198,10 @@ def _describe_population(label: str, chosen: ChosenMembers) -> Group:
         for n in chosen.members
     )
     partners = [one for info in population.members for one in read_partners(str(population.path), info.extra)]
-    on_record = all(is_on_record(info.extra) for info in population.members)
+    method, path = population.manifest.method, str(population.path)
+    on_record = all(
+        tells_origin(method, read_people(path, info.extra) is not None, info.extra) for info in population.members
+    )
     own = (describe_lineage(population),)
     return Group(label, population.manifest.method, players, own, tuple(dict.fromkeys(partners)), on_record)
 

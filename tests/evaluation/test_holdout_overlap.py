@@ -355,6 +355,13 @@ def test_an_egos_record_of_an_earlier_version_is_loaded(make: Make) -> None:
     assert not open_both(make("pupil", "hipt", 6, (11,), trained_with=pupil), lipo)[0][0].on_record
 
 
+def test_whom_ordinary_members_have_met_is_known(make: Make) -> None:
+    lipo, clones = make("lipo", "lipo", 1, (1, 2)), make("A", "human_clone", 0, (3,), **HALF_A.as_dict())
+    silent = make("silent", "human_clone", 0, (4,))
+    assert open_both(lipo, make("next", "lipo", 2, (5,)))[0][0].on_record
+    assert open_both(clones, lipo)[0][0].on_record and not open_both(silent, lipo)[0][0].on_record
+
+
 def test_a_members_identity_is_all_that_decides_how_it_acts(make: Make) -> None:
     info = load_population(make("some", "lipo", 1, (1,))).info(1)
     same = identify_member(info.model_copy(update={"seed": 9, "extra": {"a": 1}}), "rules")
