@@ -377,7 +377,8 @@ class DiscoveryConfig(Schema):
     start from what follows it in a window: the model knows too little of that."""
     trust: Weight = 0.0
     """An imagined event counts for this times its real rate over its imagined one, at most in full; 0: in full.
-    Imagined rates are taken with the present policy from unchosen states of the member's own latest play."""
+    Imagined rates are taken with the present policy from unchosen states of the member's own latest play. What earlier
+    members' self-play has shown `found_events` times counts in full: the model knows it."""
     trust_starts: Batch = 512
     """Imagined trajectories behind a comparison of the rates."""
     event_factors: dict[str, Weight] = {}

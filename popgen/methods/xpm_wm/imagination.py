@@ -440,7 +440,8 @@ class Discovery:
         old = self.rates or new
         mixed = [(1.0 - NEWEST) * before + NEWEST * now for before, now in zip(old, new, strict=True)]
         self.rates = Rates(*mixed)
-        self.shares = trusted_shares(self.rates, self.config.trust)
+        known = self.config.found_events and tally.earlier_events >= self.config.found_events
+        self.shares = np.where(known, 1.0, trusted_shares(self.rates, self.config.trust))
         figures: dict[str, float] = {}
         for index, name in enumerate(self.spec.event_names):
             figures[f"trust_{name}"] = float(self.shares[index])

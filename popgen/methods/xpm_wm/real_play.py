@@ -228,6 +228,7 @@ class Tally:
         keys: (K,) int64, ascending: players' own states that were seen.
         visits: (K,) int64, how often each.
         known: for each part of `ViewSpec.own`, (N,) int64, ascending: the values of that part that were seen.
+        earlier_events: (E,) int64, as `events` in self-play of earlier members alone.
     """
 
     events: np.ndarray
@@ -236,6 +237,7 @@ class Tally:
     keys: np.ndarray
     visits: np.ndarray
     known: tuple[np.ndarray, ...]
+    earlier_events: np.ndarray
 
 
 _LARGEST = 2**62
@@ -294,7 +296,9 @@ class TallyKeeper:
         visits = np.array([self.visits[int(key)] for key in keys], np.int64)
         known = tuple(np.array(sorted(part), np.int64) for part in self.known)
         total = sum(self.events.values(), none)
-        return Tally(total, self.events.get(own, none), self.steps.get(own, 0), keys, visits, known)
+        played = [seen for (one, kind), seen in self.events.items() if one < owner and kind == str(Kind.SP)]
+        own_events, earlier = self.events.get(own, none), sum(played, none)
+        return Tally(total, own_events, self.steps.get(own, 0), keys, visits, known, earlier)
 
     def state(self) -> dict[str, Any]:
         """Everything counted."""

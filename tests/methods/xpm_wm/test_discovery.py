@@ -33,7 +33,8 @@ def make(**options: Any) -> Discovery:
 
 def tally_of(events: list[int], own: list[int] | None = None, steps: int = 0) -> Tally:
     none = np.zeros(0, np.int64)
-    return Tally(np.array(events), np.array(own or [0] * SPEC.num_events), steps, none, none, ())
+    zero = np.zeros(SPEC.num_events, np.int64)
+    return Tally(np.array(events), zero if own is None else np.array(own), steps, none, none, (), zero)
 
 
 def model_with_events(*probable: int) -> WorldModel:
@@ -61,6 +62,13 @@ def test_rates_are_compared_over_what_was_played_since_and_averaged() -> None:
     figures = discovery.compare(imagined, tally_of([9] * 5, [2, 0, 0, 0, 0], 60))
     assert figures[f"real_rate_{SPEC.event_names[0]}"] == pytest.approx(0.05)
     assert discovery.shares[0] == pytest.approx(0.5) and discovery.shares[1] == pytest.approx(0.3)
+
+
+def test_what_earlier_members_have_done_often_is_believed_of_the_next() -> None:
+    discovery = make(trust=1.0, found_events=9)
+    tally = replace(tally_of([20] * 5, [1, 0, 0, 0, 0], 50), earlier_events=np.array([0, 8, 9, 10, 0]))
+    discovery.compare(np.full(5, 0.1), tally)
+    assert discovery.shares.tolist() == pytest.approx([0.3, 0.1, 1.0, 1.0, 0.1])  # (1 + 1/2) / 50 and (1/2) / 50
 
 
 def test_state_of_the_comparison_comes_back() -> None:
