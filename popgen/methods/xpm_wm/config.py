@@ -386,7 +386,8 @@ class DiscoveryConfig(Schema):
     which they are for are made for their own sake."""
     scaffolds: Annotated[dict[str, str], AddedLater] = {}
     """By name, an event -> the one that it is for. The nearer the real rate of that one comes to `scaffold_until`, the
-    less the first pays in imagination: paid in full for ever, it is made where nothing can follow from it."""
+    less the first pays in imagination: paid in full for ever, it is made where nothing can follow from it. It pays
+    nothing to a member whose predecessors' self-play has shown that one `found_events` times."""
     scaffold_until: Annotated[Weight, AddedLater] = 0.005
     """Real events a step, of both players together, from which on what leads to them pays nothing; needs `trust`,
     which takes the rates."""

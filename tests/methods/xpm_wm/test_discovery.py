@@ -100,6 +100,9 @@ def test_a_scaffold_pays_less_the_more_often_what_it_is_for_is_reached() -> None
     discovery.rates = Rates(np.zeros(5), np.array([0.1, 0.1, 0.002, 0.006, 0.0]))
     assert discovery.scaffold_shares().tolist() == pytest.approx([0.5, 0.0, 1.0, 1.0, 1.0])
     paid = discovery.pay(model_with_events(0, 1, SOUP), latent)
+    later = make(trust=1.0, scaffolds={onion: potted, dish: soup}, found_events=9)
+    later.tally = replace(tally_of([99] * 5), earlier_events=np.array([0, 0, 9, 8, 0]))
+    assert later.scaffold_shares().tolist() == [0.0, 1.0, 1.0, 1.0, 1.0]
     assert torch.allclose(paid.reward, torch.full((3, 2), 0.5 + 0.0 + 3.0), atol=1e-5)
 
 
