@@ -274,12 +274,9 @@ class XpmWmWorkers:
         cluster, seed, start = config.cluster, config.run.seed * 1000, transport.start
         self.pool = start_samplers(config, attempt, transport)
         place, capacity = Place(cluster.replay_cpus), config.replay.capacity
-        counted, places = (
-            config.world_model.view if used else ""
-            for used in (config.discovery.count_bonus, config.replay.event_places)
-        )
+        counted = config.world_model.view if config.discovery.count_bonus else ""
         self.replays: dict[str, Worker[ReplayActor]] = {
-            name: start(ReplayActor, place, config.env, capacity, seed + number, counted, places)
+            name: start(ReplayActor, place, config.env, capacity, seed + number, counted)
             for name, number in zip(BUFFERS, (11, 12), strict=True)
         }
         self.model: Worker[WorldModelActor] = start(

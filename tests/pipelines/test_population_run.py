@@ -438,7 +438,7 @@ def test_imagination_starts_from_windows_of_an_event_once_self_play_has_started(
     config = smoke(root, "unused", f"phase1.event_starts={event_starts}")
     asked: list[ModelTask] = []
     none = np.zeros(0, np.int64)
-    tally = Tally(np.array([9, 8, 9, 9, 0]), np.zeros(5, np.int64), 0, none, none, (), np.zeros(5, np.int64))
+    tally = Tally(np.array([9, 8, 9, 9, 0]), np.zeros(5, np.int64), 0, none, none, ())
     work: Any = SimpleNamespace(update_world_model=asked.append, tally=lambda member: Ready(tally))
     progress = FirstMemberProgress(16, self_play_has_begun=plays)
     spec = make_env(config.env.name, 1).spec

@@ -240,10 +240,6 @@ class ReplayConfig(Schema):
     """Steps that each of the buffers B_SP and B_XP holds (the paper's buffer size)."""
     event_fraction: Fraction = 0.4
     """Share of a model batch's windows that are drawn for an event in them, the kinds in turn."""
-    event_places: Annotated[bool, AddedLater] = False
-    """Draw these windows evenly over the places where the event happened (the own state, in a view's `own` entries, of
-    the player who caused it), not over its occurrences: a second pot that is seldom used is known as well as the first.
-    """
 
 
 class Phase1Config(Schema):
@@ -377,8 +373,7 @@ class DiscoveryConfig(Schema):
     start from what follows it in a window: the model knows too little of that."""
     trust: Weight = 0.0
     """An imagined event counts for this times its real rate over its imagined one, at most in full; 0: in full.
-    Imagined rates are taken with the present policy from unchosen states of the member's own latest play. What earlier
-    members' self-play has shown `found_events` times counts in full: the model knows it."""
+    Imagined rates are taken with the present policy from unchosen states of the member's own latest play."""
     trust_starts: Batch = 512
     """Imagined trajectories behind a comparison of the rates."""
     event_factors: dict[str, Weight] = {}
@@ -386,8 +381,7 @@ class DiscoveryConfig(Schema):
     which they are for are made for their own sake."""
     scaffolds: Annotated[dict[str, str], AddedLater] = {}
     """By name, an event -> the one that it is for. The nearer the real rate of that one comes to `scaffold_until`, the
-    less the first pays in imagination: paid in full for ever, it is made where nothing can follow from it. It pays
-    nothing to a member whose predecessors' self-play has shown that one `found_events` times."""
+    less the first pays in imagination: paid in full for ever, it is made where nothing can follow from it."""
     scaffold_until: Annotated[Weight, AddedLater] = 0.005
     """Real events a step, of both players together, from which on what leads to them pays nothing; needs `trust`,
     which takes the rates."""

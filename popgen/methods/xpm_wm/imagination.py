@@ -388,20 +388,14 @@ class Discovery:
         return Paid((events * weights.to(self.device)).sum(-1), keep)
 
     def scaffold_shares(self) -> np.ndarray:
-        """(E,) float64 within [0, 1]: what is left of the pay of events that only lead to others; nothing where earlier
-        members have done these often."""
-        shares, names, known = np.ones(self.spec.num_events), self.spec.event_names, self._known_events()
+        """(E,) float64 within [0, 1]: what is left of the pay of events that only lead to others."""
+        shares, names, rates = np.ones(self.spec.num_events), self.spec.event_names, self.rates
+        if rates is None:
+            return shares
         for name, goal in self.config.scaffolds.items():
-            at = names.index(goal)
-            reached = 0.0 if self.rates is None else self.rates.real[at] / max(self.config.scaffold_until, 1e-12)
-            shares[names.index(name)] = 0.0 if known[at] else max(0.0, 1.0 - reached)
+            reached = rates.real[names.index(goal)] / max(self.config.scaffold_until, 1e-12)
+            shares[names.index(name)] = max(0.0, 1.0 - reached)
         return shares
-
-    def _known_events(self) -> np.ndarray:
-        """(E,) bool: what earlier members' self-play has shown often enough to count as found."""
-        if self.tally is None or not self.config.found_events:
-            return np.zeros(self.spec.num_events, bool)
-        return self.tally.earlier_events >= self.config.found_events
 
     def bonus(self, model: WorldModel, arrived: Latent, scale: float) -> Float[Tensor, "*batch"]:
         """For each player `scale` / sqrt(1 + n), n the real visits of the state of its own that the model shows. A
@@ -446,8 +440,7 @@ class Discovery:
         old = self.rates or new
         mixed = [(1.0 - NEWEST) * before + NEWEST * now for before, now in zip(old, new, strict=True)]
         self.rates = Rates(*mixed)
-        self.tally = tally
-        self.shares = np.where(self._known_events(), 1.0, trusted_shares(self.rates, self.config.trust))
+        self.shares = trusted_shares(self.rates, self.config.trust)
         figures: dict[str, float] = {}
         for index, name in enumerate(self.spec.event_names):
             figures[f"trust_{name}"] = float(self.shares[index])

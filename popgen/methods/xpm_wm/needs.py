@@ -111,9 +111,6 @@ def _check_discovery(config: WorldModelRun, spec: EnvSpec) -> None:
     if config.discovery.count_bonus and not (view.own and view.binary):
         problem = f"view {config.world_model.view!r} of {spec.name} does not tell a player's own state apart"
         raise UserError("discovery.count_bonus", problem, "set it to 0 or choose another view")
-    if config.replay.event_places and not (view.own and view.binary):
-        problem = f"view {config.world_model.view!r} of {spec.name} does not tell a player's own state apart"
-        raise UserError("replay.event_places", problem, "leave it out or choose another view")
     scaffolds = config.discovery.scaffolds
     named = {"event_factors": [*config.discovery.event_factors], "scaffolds": [*scaffolds, *scaffolds.values()]}
     for field, name in ((field, name) for field, names in named.items() for name in names):

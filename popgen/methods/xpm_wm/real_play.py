@@ -228,7 +228,6 @@ class Tally:
         keys: (K,) int64, ascending: players' own states that were seen.
         visits: (K,) int64, how often each.
         known: for each part of `ViewSpec.own`, (N,) int64, ascending: the values of that part that were seen.
-        earlier_events: (E,) int64, as `events` in self-play of earlier members alone.
     """
 
     events: np.ndarray
@@ -237,7 +236,6 @@ class Tally:
     keys: np.ndarray
     visits: np.ndarray
     known: tuple[np.ndarray, ...]
-    earlier_events: np.ndarray
 
 
 _LARGEST = 2**62
@@ -296,9 +294,7 @@ class TallyKeeper:
         visits = np.array([self.visits[int(key)] for key in keys], np.int64)
         known = tuple(np.array(sorted(part), np.int64) for part in self.known)
         total = sum(self.events.values(), none)
-        played = [seen for (one, kind), seen in self.events.items() if one < owner and kind == str(Kind.SP)]
-        own_events, earlier = self.events.get(own, none), sum(played, none)
-        return Tally(total, own_events, self.steps.get(own, 0), keys, visits, known, earlier)
+        return Tally(total, self.events.get(own, none), self.steps.get(own, 0), keys, visits, known)
 
     def state(self) -> dict[str, Any]:
         """Everything counted."""

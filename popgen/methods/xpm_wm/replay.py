@@ -17,7 +17,6 @@ from popgen.envs import make_env
 from popgen.envs.contract import BatchedEnv, EnvSpec
 from popgen.methods.training import Pending
 from popgen.methods.xpm_wm.config import DiscoveryConfig, WorldModelRun
-from popgen.methods.xpm_wm.event_places import EventPlaces
 from popgen.methods.xpm_wm.real_play import Tally, TallyKeeper, event_pay
 from popgen.types import Kind, Segment
 
@@ -81,20 +80,16 @@ class Replay:
         env: encodes states; its own episode is not touched.
         capacity: rows; each takes the bytes of a state and 2 + P * E + 15 more.
         seed: of the sampling generator.
-        places: view whose players' own states tell apart where an event happened; windows for an event are drawn
-            evenly over these. "": evenly over its occurrences.
     """
 
     COLUMNS = ("states", "actions", "events", "first", "terminal", "stream", "owner", "partner", "kind")
 
-    def __init__(self, env: BatchedEnv, capacity: int, seed: int, places: str = "") -> None:
+    def __init__(self, env: BatchedEnv, capacity: int, seed: int) -> None:
         spec = env.spec
         self.env, self.capacity = env, capacity
-        self.places = EventPlaces(env, places) if places else None
         self.rng = np.random.default_rng(seed)
         self.size = self.head = self.streams = self.added = 0
         self._cache: dict[Any, np.ndarray] = {}
-        self.places = EventPlaces(env, places) if places else None
         self.states = np.zeros((capacity, spec.state_size), spec.state_dtype)
         self.actions = np.zeros((capacity, 2), np.uint8)
         self.events = np.zeros((capacity, 2, spec.num_events), np.uint8)
@@ -185,8 +180,6 @@ class Replay:
         for slot in range(by_event(batch, event_fraction)):
             event = (turn + slot) % self.env.spec.num_events
             rows = self.rows(query, event)
-            if self.places and len(rows):
-                rows = self.places.draw((query, event), rows, self.states, self.events[..., event], self.rng)
             if len(rows):
                 offset = int(self.rng.integers(0, length - 1))
                 picked = self._draw_starts(rows, 1, length, offset=offset, strict=False)
@@ -252,8 +245,13 @@ class Replay:
     def state(self) -> dict[str, Any]:
         """Everything needed to continue: arrays of the filled part, counters and the generator (JSON-able)."""
         arrays = {name: column[: self.size].copy() for name, column in self._stored_columns().items()}
-        counters = {name: getattr(self, name) for name in ("head", "streams", "added")}
-        return {"arrays": arrays, "counters": counters | {"rng": self.rng.bit_generator.state}}
+        counters = {
+            "head": self.head,
+            "streams": self.streams,
+            "added": self.added,
+            "rng": self.rng.bit_generator.state,
+        }
+        return {"arrays": arrays, "counters": counters}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Replace the contents with `state()` of another replay.
@@ -404,11 +402,10 @@ class ReplayActor:
 
     Args:
         counted: view whose players' own states are counted; "" for none.
-        places: see `Replay`.
     """
 
-    def __init__(self, env: EnvConfig, capacity: int, seed: int, counted: str = "", places: str = "") -> None:
-        self.replay = Replay(make_env(env.name, 1, **env.params), capacity, seed, places)
+    def __init__(self, env: EnvConfig, capacity: int, seed: int, counted: str = "") -> None:
+        self.replay = Replay(make_env(env.name, 1, **env.params), capacity, seed)
         self.keeper = TallyKeeper(self.replay.env, counted)
         self.seen: set[tuple[str, int]] = set()
         self.turn = 0

@@ -33,8 +33,7 @@ def make(**options: Any) -> Discovery:
 
 def tally_of(events: list[int], own: list[int] | None = None, steps: int = 0) -> Tally:
     none = np.zeros(0, np.int64)
-    zero = np.zeros(SPEC.num_events, np.int64)
-    return Tally(np.array(events), zero if own is None else np.array(own), steps, none, none, (), zero)
+    return Tally(np.array(events), np.array(own or [0] * SPEC.num_events), steps, none, none, ())
 
 
 def model_with_events(*probable: int) -> WorldModel:
@@ -62,13 +61,6 @@ def test_rates_are_compared_over_what_was_played_since_and_averaged() -> None:
     figures = discovery.compare(imagined, tally_of([9] * 5, [2, 0, 0, 0, 0], 60))
     assert figures[f"real_rate_{SPEC.event_names[0]}"] == pytest.approx(0.05)
     assert discovery.shares[0] == pytest.approx(0.5) and discovery.shares[1] == pytest.approx(0.3)
-
-
-def test_what_earlier_members_have_done_often_is_believed_of_the_next() -> None:
-    discovery = make(trust=1.0, found_events=9)
-    tally = replace(tally_of([20] * 5, [1, 0, 0, 0, 0], 50), earlier_events=np.array([0, 8, 9, 10, 0]))
-    discovery.compare(np.full(5, 0.1), tally)
-    assert discovery.shares.tolist() == pytest.approx([0.3, 0.1, 1.0, 1.0, 0.1])  # (1 + 1/2) / 50 and (1/2) / 50
 
 
 def test_state_of_the_comparison_comes_back() -> None:
@@ -100,9 +92,6 @@ def test_a_scaffold_pays_less_the_more_often_what_it_is_for_is_reached() -> None
     discovery.rates = Rates(np.zeros(5), np.array([0.1, 0.1, 0.002, 0.006, 0.0]))
     assert discovery.scaffold_shares().tolist() == pytest.approx([0.5, 0.0, 1.0, 1.0, 1.0])
     paid = discovery.pay(model_with_events(0, 1, SOUP), latent)
-    later = make(trust=1.0, scaffolds={onion: potted, dish: soup}, found_events=9)
-    later.tally = replace(tally_of([99] * 5), earlier_events=np.array([0, 0, 9, 8, 0]))
-    assert later.scaffold_shares().tolist() == [0.0, 1.0, 1.0, 1.0, 1.0]
     assert torch.allclose(paid.reward, torch.full((3, 2), 0.5 + 0.0 + 3.0), atol=1e-5)
 
 

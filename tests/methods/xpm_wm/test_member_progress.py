@@ -211,7 +211,7 @@ def test_with_a_plateau_a_later_member_goes_on_while_it_improves() -> None:
 
 def test_rare_events_are_those_seen_too_seldom() -> None:
     none = np.zeros(0, np.int64)
-    tally = Tally(np.array([7, 3, 0]), np.zeros(3, np.int64), 0, none, none, (), np.zeros(3, np.int64))
+    tally = Tally(np.array([7, 3, 0]), np.zeros(3, np.int64), 0, none, none, ())
     assert rare_events(tally, DiscoveryConfig(rare_events=4)) == (1, 2)
     assert rare_events(tally, DiscoveryConfig()) == () == rare_events(None, DiscoveryConfig(rare_events=4))
     assert not goes_by_tally(DiscoveryConfig()) and goes_by_tally(DiscoveryConfig(trust=2.0))

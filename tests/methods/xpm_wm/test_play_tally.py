@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from support.small import kitchen, random_play
 
 from popgen.durable_files import load_state, save_state
 from popgen.methods.xpm_wm.real_play import TallyKeeper, part_weights
-from popgen.types import Kind
 
 VIEW = kitchen().spec.views["features"]
 
@@ -50,11 +48,6 @@ def test_events_of_a_members_self_play_are_told_from_all() -> None:
     tally = keeper.tally(2)
     assert tally.events.tolist() == (first.events.sum((0, 1, 2)) + second.events.sum((0, 1, 2))).tolist()
     assert tally.own_steps == 0 and not tally.own_events.any()  # random play is nobody's self-play
-    assert not tally.earlier_events.any()
-    keeper.add(replace(first, kind=Kind.SP), 1)
-    seen = first.events.sum((0, 1, 2)).tolist()
-    assert keeper.tally(1).own_events.tolist() == keeper.tally(2).earlier_events.tolist() == seen
-    assert not keeper.tally(1).earlier_events.any() and not keeper.tally(2).own_events.any()
 
 
 def test_counts_come_back_from_a_checkpoint(tmp_path: Path) -> None:
@@ -64,7 +57,7 @@ def test_counts_come_back_from_a_checkpoint(tmp_path: Path) -> None:
     again.load_state(load_state(tmp_path / "s")["keeper"])
     tally, wanted = again.tally(1), keeper.tally(1)
     assert tally.own_steps == wanted.own_steps and len(tally.known) == len(wanted.known) == 3
-    for name in ("events", "own_events", "earlier_events", "keys", "visits"):
+    for name in ("events", "own_events", "keys", "visits"):
         assert np.array_equal(getattr(tally, name), getattr(wanted, name))
     assert all(np.array_equal(a, b) for a, b in zip(tally.known, wanted.known, strict=True))
 

@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.small import kitchen, random_play
 
-from popgen.methods.xpm_wm.event_places import EventPlaces, split_by_key
 from popgen.methods.xpm_wm.replay import KIND_CODE, Query, Replay, Request, draw, find_most_paid, join
 from popgen.types import RANDOM_MEMBER, Kind, Segment
 
@@ -387,52 +385,3 @@ def test_requests() -> None:
     assert joined.kind.tolist() == [KIND_CODE[Kind.SP]] * 4 + [KIND_CODE[Kind.XP]] * 11
     assert joined.partner.tolist() == [0] * 4 + [1] * 11
     assert np.array_equal(joined.obs[4:9], second.obs) and joined.obs.shape == (15, 3, 2, 2)
-
-
-def test_rows_are_split_by_key_in_order() -> None:
-    parts = split_by_key(np.array([10, 11, 12, 13]), np.array([5, 2, 5, 2]))
-    assert [part.tolist() for part in parts] == [[11, 13], [10, 12]]
-    assert split_by_key(np.array([], np.int64), np.array([], np.int64)) == []
-
-
-def test_windows_for_an_event_are_drawn_evenly_over_its_places() -> None:
-    """Places are told apart by the causing player's cell and orientation, read from the states themselves."""
-    env = kitchen(8)
-    replay = Replay(kitchen(), 40_000, 0)
-    for segment in random_play(env, 1000):
-        replay.add(segment, 1)
-    event = env.spec.event_names.index("takes_ingredient")
-    rows = replay.rows(Query(), event)
-    who = replay.events[rows, :, event].argmax(1)
-    own = np.stack([replay.states[rows, part + who] for part in (0, 2, 4)], 1)  # cell, orientation, object
-    groups = split_by_key(rows, np.unique(own, axis=0, return_inverse=True)[1].ravel())
-    assert len(groups) >= 2 and min(map(len, groups)) > 50
-    rows = np.setdiff1d(rows, groups[0][5:])  # one place is left with five
-    places, rng, caused = EventPlaces(replay.env, "features"), np.random.default_rng(0), replay.events[..., event]
-    drawn = [tuple(places.draw("onions", rows, replay.states, caused, rng)) for _ in range(600)]
-    kept = [tuple(groups[0][:5]), *map(tuple, groups[1:])]
-    even = 600 / len(kept)
-    assert set(kept) == set(drawn) and all(abs(drawn.count(group) - even) < 4 * even**0.5 for group in kept)
-
-
-def test_a_replay_draws_by_places_where_it_is_asked_to() -> None:
-    """A batch of which all windows are for an event: most are of the event's rarer place, which has few rows."""
-    plain, even = (Replay(kitchen(), 40_000, 0, places) for places in ("", "features"))
-    for replay in (plain, even):
-        for segment in random_play(kitchen(8), 1000):
-            replay.add(segment, 1)
-    event = kitchen().spec.event_names.index("takes_ingredient")
-    for replay in (plain, even):
-        replay.events[..., :event] = replay.events[..., event + 1 :] = 0
-        rows = replay.rows(Query(), event)
-        keys = replay.states[rows, replay.events[rows, :, event].argmax(1)]
-        rare = min(set(keys.tolist()), key=keys.tolist().count)
-        dropped = rows[keys == rare][3:]
-        replay.events[dropped] = 0
-        replay._cache.clear()
-    shares = []
-    for replay in (plain, even):
-        starts = replay.sample(400, 2, Query(), event_fraction=1.0)
-        caused = replay.events[starts, :, event].any(1)
-        shares.append(len(set(starts[caused].tolist())) / caused.sum())
-    assert shares[0] > 1.2 * shares[1]  # the three rows of the rare place are drawn again and again
