@@ -32,7 +32,9 @@ PARTS: dict[str, tuple[str, ...]] = {
 """Kinds of work -> how the names of torch's operators begin (after `aten::` and underscores); all else is `other`."""
 
 SIZES = (512, 1024, 2048)
-"""Sides of the square matrices among which the peak is looked for."""
+"""Sides of the square matrices among which the peak is looked for, ascending."""
+LONGEST = 2.0
+"""Seconds that a product may take by the rate of smaller ones; a format that the processor lacks takes a minute."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,8 @@ def measure_peak(dtype: torch.dtype, seconds: float) -> float:
     """The most floating-point operations a second that products of square matrices reach here."""
     best = 0.0
     for size in SIZES:
+        if best and 2.0 * size**3 / best > LONGEST:
+            break
         left, right = (torch.randn(size, size).to(dtype) for _ in range(2))
         count, took = _repeat_work(lambda a=left, b=right: a @ b, seconds / len(SIZES))
         best = max(best, 2.0 * size**3 * count / took)

@@ -13,7 +13,7 @@ REPORT_BYTES = 16 * 2**20
 _OWN_FILES = {
     "manifest.json": "a population",
     "member.json": "a member of a population",
-    "ledger.jsonl": "a run",
+    "config.json": "a run",
     "study.json": "a study",
 }
 """A file that only such a folder has -> what the folder is."""

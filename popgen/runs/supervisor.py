@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -49,8 +50,14 @@ def guarded(folder: Path, retries: int) -> int | None:
     if not sys.platform.startswith("linux"):
         return None
     spent, most = 0, -1
-    while (pid := _fork_child()) != 0:
-        code, asked = _wait_for_child(pid)
+    while True:
+        # A signal that comes while the child is made waits until it can be forwarded: what Python runs after a fork
+        # swallows exceptions, KeyboardInterrupt too.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, FORWARDED)
+        if (pid := _fork_child()) == 0:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            return None
+        code, asked = _wait_for_child(pid, mask)
         if asked and code == RAY_ENDED_US:
             return 128 + asked  # whoever ends us may have ended Ray's processes too, and its library then the child
         if not _without_a_word(folder, pid, code):
@@ -61,7 +68,6 @@ def guarded(folder: Path, retries: int) -> int | None:
             problem = f"Ray ended the driver {spent} times in a row without progress"
             raise UserError("cluster", problem, "see Ray's logs; the same run.id goes on from the last checkpoint")
         print(f"popgen: Ray ended the driver: {folder.name} goes on from its last checkpoint", file=sys.stderr)
-    return None
 
 
 def end_with_parent() -> None:
@@ -84,9 +90,9 @@ def _fork_child() -> int:
     return 0
 
 
-def _wait_for_child(pid: int) -> tuple[int, int]:
+def _wait_for_child(pid: int, mask: Iterable[int]) -> tuple[int, int]:
     """The child's exit code, or less the number of the signal that ended it; and the signal by which we were asked to
-    end meanwhile, 0 without one. Signals are forwarded."""
+    end meanwhile, 0 without one. Signals are forwarded, from where `mask` blocks them no more."""
     asked = 0
 
     def forward(number: int, frame: FrameType | None) -> None:
@@ -99,6 +105,7 @@ def _wait_for_child(pid: int) -> tuple[int, int]:
             os.kill(os.getpid(), signal.SIGSTOP)
 
     before = {number: signal.signal(number, forward) for number in FORWARDED}
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     try:  # not blocked in waitpid: a signal that comes just before it would wait there with us
         while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
             time.sleep(LOOK)

@@ -55,7 +55,7 @@ def test_bad_grids_are_told_in_one_line(case):
         ({"layout": "cramped_rom"}, "env.layout", "did you mean cramped_room"),
         ({"layout": "zzz"}, "env.layout", "unknown layout 'zzz'"),
         ({"layout": "custom"}, "env.grid", "is missing: 'custom' is no layout"),
-        ({"layout": "no/such.layout"}, "env.layout", "unknown layout"),
+        ({"layout": "no/such.layout"}, "env.layout", "there is no file no/such.layout"),
         ({"layout": "/etc/passwd"}, "env.layout", "unknown layout"),
         ({"layout": "cramped_room_single"}, "env.layout", "exactly two players"),
         ({"layout": "multiplayer_schelling"}, "env.layout", "has players 1234"),

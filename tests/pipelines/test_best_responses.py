@@ -250,5 +250,5 @@ def test_diversity_is_printed_and_refuses_in_one_line(run: Run, tmp_path: Path) 
     assert code == 0 and "over members only 2 of 3 partners are linearly independent" in out
     report = json.loads(Path("diversity/diversity.json").read_text())["over"]["members"]
     assert (report["rank"], report["determinant"], report["log_determinant"]) == (2, 0.0, None)
-    code, out, err = run("diversity", str(copies), "--episodes", "2", "--choose", "3")
+    code, out, err = run("diversity", str(copies), "--episodes", "2", "--choose", "3", "--quiet")
     assert code == 2 and "--choose: is 3, but by their own events only 2 of 3" in err and err.count("\n") == 1

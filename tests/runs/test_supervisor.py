@@ -111,6 +111,15 @@ def test_an_interruption_reaches_the_driver_once_and_ends_both(tmp_path: Path) -
     assert child == group != str(process.pid)  # so that a terminal's signal comes from us alone
 
 
+def test_an_interruption_while_the_driver_is_made_is_not_lost(tmp_path: Path) -> None:
+    """What Python runs after a fork swallows the exception of a signal that comes then."""
+    early = "import os, signal; os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+    command = [sys.executable, "-c", early + PROGRAM, str(tmp_path / "r"), "2", "waits", "finished"]
+    (tmp_path / "r").mkdir()
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert process.returncode in (130, -signal.SIGINT) and "ignored" not in process.stderr, process.stderr
+
+
 def test_a_signal_that_nobody_handles_ends_both(tmp_path: Path) -> None:
     process = start(tmp_path / "r", 2, "waits", "finished")
     assert process.stdout is not None and process.stdout.readline() == "waits\n"
