@@ -13,7 +13,7 @@ from typing import Any
 from popgen.cli.arguments import add_command, add_config_dir
 from popgen.cli.compose import Composed, compose_sources
 from popgen.cli.preset_files import find_preset_folder
-from popgen.cli.printing import OK, print_json
+from popgen.cli.printing import OK, WIDTH, print_json
 from popgen.errors import UserError
 from popgen.methods.recipe import Setting, SourcedSetting
 
@@ -96,7 +96,7 @@ def _list_choices(args: argparse.Namespace) -> int:
     if args.json:
         print_json(choices)
     else:
-        print("\n".join(describe_choices(choices, 80)))
+        print("\n".join(describe_choices(choices, WIDTH)))
     return OK
 
 
